@@ -262,6 +262,26 @@ def test_the_wall_is_in_the_maps_and_is_no_table(hard_capture):
     assert np.allclose(points @ wall["normal"], wall["offset_mm"], atol=0.01)
 
 
+def test_a_table_ends_at_its_edge_and_a_floor_lies_below():
+    for name in ("mitsuba", "embreex"):
+        pytest.importorskip(name, reason=f"{name} is not installed: pip install 'shadowgraph[generator]'")
+    from examples.generator import truth as maps
+    from examples.generator.rendering import stage
+
+    setup = Setup(table=Table(edge=100.0), phone=Phone(width=120, azimuth=-90.0))
+    thing, fixed = scene(setup)
+    edge = poses.edge_of(setup, thing)
+    assert edge is not None and poses.wall_of(setup, thing) is None
+    seen = maps.seen(maps.Rays(thing), fixed, setup, lay(BOARD, setup))
+    floor, table = ~seen.is_table & ~seen.mask, seen.is_table
+    assert floor.mean() > 0.05 and np.allclose(seen.points[floor][:, 2], -poses.FLOOR_MM)
+    assert (seen.points[table] @ edge.normal).min() >= edge.offset
+    shapes = stage(setup, BOARD, thing, fixed.camera, np.random.default_rng(0)).shapes
+    top, below = shapes["table"].bbox(), shapes["floor"].bbox()
+    assert top.max[1] == pytest.approx(-edge.offset) and np.allclose(edge.normal, [0, -1, 0])
+    assert below.max[2] == pytest.approx(-poses.FLOOR_MM)
+
+
 def test_the_masks_from_the_side_show_the_object(hard_capture):
     (entry,) = truth(hard_capture, "side_photos")
     mask = cv2.imread(str(hard_capture / "gt/side" / f"{entry['file'][:-4]}_mask.png"), cv2.IMREAD_GRAYSCALE) > 127

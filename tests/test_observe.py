@@ -10,7 +10,7 @@ from synthetic import BALL, HEAP, Box, Look, Sphere, default_lights, render
 
 from reconstruct.labels import ground_test as ground_module
 from reconstruct.labels.labels import assemble_labels, not_isolated
-from reconstruct.labels.outline import local_mean, object_region
+from reconstruct.labels.outline import local_mean, may_hold_shadow, object_region
 from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.scene import Scene, reduced
 
@@ -314,3 +314,27 @@ def test_dark_paint_of_another_hue_is_object_and_no_ground_in_the_dark(paint):
     found = ground_module.test_ground(wooden)
     assert iou(found.mask, truth) > 0.95
     assert found.mask_confidence[inside].gt(0).float().mean() > 0.95
+
+
+def test_what_is_dark_where_no_shadow_of_the_object_may_fall_is_no_shadow():
+    """A table ends at a line; the floor behind it stays dark under some lights, as does ground behind a flashlight."""
+    scene, truth = render(HEAP, PLAIN)
+    beyond = np.zeros(truth.mask.shape, bool)
+    beyond[:8] = True
+    dark = torch.zeros(len(scene.rgb), 1, 1, dtype=torch.bool)
+    dark[::4] = True
+    rgb = torch.where((dark & tensor(beyond).bool())[..., None], 0.02 * scene.rgb, scene.rgb)
+    found = ground_module.test_ground(replace(scene, rgb=rgb))
+    said = (found.confidence > 0) & (found.visibility < 0.5) & torch.from_numpy(beyond & (truth.visibility > 0.5))
+    assert not said.any()
+    kept = (truth.visibility < 0.5) & ~truth.mask & ~beyond
+    assert (found.confidence.numpy()[kept] > 0).mean() > 0.9
+
+
+def test_where_the_object_is_cut_by_the_frame_every_shadow_may_be_its_own():
+    scene, truth = render(HEAP, PLAIN)
+    whole = torch.from_numpy(truth.mask)
+    assert 0.02 < may_hold_shadow(scene, whole).float().mean() < 0.8
+    cut = whole.clone()
+    cut[:, 0] = True
+    assert may_hold_shadow(scene, cut).all() and may_hold_shadow(scene, torch.zeros_like(whole)).all()

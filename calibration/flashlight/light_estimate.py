@@ -11,6 +11,7 @@ from calibration.flashlight.duplicates import earlier_duplicate
 from calibration.flashlight.fit import (
     LAST,
     FlashlightFit,
+    cells_on_table,
     collect,
     first_guess,
     fit_flashlights,
@@ -216,8 +217,9 @@ def locate_lights(
     """Estimate one point light per usable photo (world), with the beam and the ambient light they share.
 
     Only camera and ground are known. Steps: mean colour of ground cells, a search over a hemisphere of flashlight
-    places, then a robust fit of all flashlights together. The object and its shadows are rejected as outliers. Where
-    that places too few lights, outlines of shadows and shading are fitted together.
+    places, then a robust fit of all flashlights together. The object and its shadows are rejected as outliers, and what
+    lies beyond the table's edge is left out. Where that places too few lights, outlines of shadows and shading are
+    fitted together.
 
     Args:
         stack: one fixed camera, relative exposure divided out.
@@ -229,7 +231,12 @@ def locate_lights(
         CalibrationError: fewer than 4 photos or lights, or too little bare ground in view.
     """
     evidence, photos = collect(stack, posed_camera, usable)
-    fit = without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent))
+    fit = fit_flashlights(first_guess(evidence), evidence, free_tangent)
+    on_table = cells_on_table(fit)
+    if not on_table.all():
+        evidence = replace(evidence, weight=evidence.weight * on_table)
+        fit = fit_flashlights(first_guess(evidence), evidence, free_tangent)
+    fit = without_gloss(fit)
     fit = with_oval_beams(refit_outliers(fit), evidence)
     names = [stack.paths[k].name for k in photos]
     tone = compare_curves(fit, np.array(stack.gains)[photos])

@@ -39,7 +39,7 @@ def make_views(out: Path, ready: Stage, say: Say) -> None:
     fixed = poses.tripod(setup, board, ready.thing)
     shared = {f"IMG_{i:04d}.jpg": v for i, v in enumerate(poses.handheld(fixed, board, setup, rng), 2)}
     take_board(out / "board", ready, shared, -1, rng, say)
-    truth.write_scene(out / "gt", lay(board, setup), shared or {"": fixed}, setup, None)
+    truth.write_scene(out / "gt", lay(board, setup), shared or {"": fixed}, setup, ready.thing)
     (out / "gt" / "camera.json").unlink()
     truth.write_object(out / "gt", ready.thing, setup)
     (out / "session.toml").write_text(f'board = "{board.spec()}"\n')
@@ -83,7 +83,7 @@ def _take(place: Place, ready: Stage, say: Say) -> poses.Viewpoint:
     named = {f"IMG_{place.first + 1:04d}.jpg": fixed}
     take_board(place.folder / "board", ready, named, place.first, rng, say)
     place.truth.mkdir(parents=True)
-    truth.write_scene(place.truth, lay(ready.board, setup), named, setup, None)
+    truth.write_scene(place.truth, lay(ready.board, setup), named, setup, ready.thing)
     take_photos(place, ready, fixed, rng, say)
     return fixed
 
@@ -168,7 +168,9 @@ def refuse_impossible(setup: Setup, board: AnyBoard) -> None:
     """Check what does not go with several places.
 
     Raises:
-        CaptureError: a wall, side photos, or light photos.
+        CaptureError: a wall, a table's edge, side photos, or light photos.
     """
-    if setup.has_places() and (setup.table.wall > 0 or setup.further.side_photos or setup.further.light_photos):
-        raise CaptureError(f"--views and --lies go without --wall, --side-photos and --light-photos ({board.spec()}).")
+    table, further = setup.table, setup.further
+    if setup.has_places() and (table.wall > 0 or table.edge > 0 or further.side_photos or further.light_photos):
+        without = "--wall, --edge, --side-photos and --light-photos"
+        raise CaptureError(f"--views and --lies go without {without} ({board.spec()}).")

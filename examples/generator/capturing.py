@@ -45,7 +45,7 @@ def make_capture(out: Path, setup: Setup, say: Say) -> None:
         return
     views = {f"IMG_{i:04d}.jpg": v for i, v in enumerate([fixed, *poses.handheld(fixed, board, setup, rng)], 1)}
     take_board(out / "board", ready, views, 0, rng, say)
-    truth.write_scene(out / "gt", lay(board, setup), views, setup, poses.wall_of(setup, thing))
+    truth.write_scene(out / "gt", lay(board, setup), views, setup, thing)
     truth.write_object(out / "gt", thing, setup)
     if setup.further.side_photos:
         take_sides(out, ready, fixed, say)

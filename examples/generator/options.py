@@ -54,6 +54,8 @@ class Table:
     """The printed sheet does not lie flat: height of its waves in mm."""
     wall: float = 0.0
     """A wall this many mm behind the object, seen from the camera; 0 is none."""
+    edge: float = 0.0
+    """The table ends this many mm behind the object, and a floor lies 740 mm lower; 0 is a table without end."""
 
 
 @dataclass(frozen=True)

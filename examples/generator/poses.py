@@ -18,6 +18,7 @@ from .paint import sheet
 Vector = Float[np.ndarray, "3"]
 Blocked = Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]]
 PAPER_MM = 0.15  # the printed side is z = 0, the table lies below
+FLOOR_MM = 740.0  # below the printed side
 GAP_MM = 15.0  # between board and object
 FILL = 1.05  # how much higher than its content the picture is
 SHADOW_ROOM = 1.6  # of the object's size: ground around it that takes its shadows
@@ -112,8 +113,8 @@ def tripod(setup: Setup, board: AnyBoard, thing: trimesh.Trimesh) -> Viewpoint:
 
 
 @dataclass(frozen=True)
-class Wall:
-    """An upright plane: normal . x = offset; the room is on the side of the normal."""
+class Upright:
+    """An upright plane: normal . x = offset; the object is on the side of the normal."""
 
     normal: Vector
     offset: float
@@ -123,12 +124,22 @@ class Wall:
         return float(self.normal @ place) - self.offset < ROOM_TO_WALL_MM
 
 
-def wall_of(setup: Setup, thing: trimesh.Trimesh) -> Wall | None:
+def wall_of(setup: Setup, thing: trimesh.Trimesh) -> Upright | None:
     """Return the wall behind the object."""
     if setup.table.wall <= 0:
         return None
+    return _upright(setup, thing, setup.table.wall)
+
+
+def edge_of(setup: Setup, thing: trimesh.Trimesh) -> Upright | None:
+    """Return the upright plane at which the table ends; its normal points over the table."""
+    return _upright(setup, thing, setup.table.edge) if setup.table.edge > 0 else None
+
+
+def _upright(setup: Setup, thing: trimesh.Trimesh, behind: float) -> Upright:
+    """Return the plane across the camera's view, so many mm behind the object."""
     normal = direction(0.0, setup.phone.azimuth)
-    return Wall(normal, float(normal @ thing.bounds.mean(0)) - setup.table.wall)
+    return Upright(normal, float(normal @ thing.bounds.mean(0)) - behind)
 
 
 def handheld(view: Viewpoint, board: AnyBoard, setup: Setup, rng: np.random.Generator) -> list[Viewpoint]:
@@ -233,7 +244,7 @@ def lamps(setup: Setup, count: int, thing: trimesh.Trimesh, board: AnyBoard, rng
     return [out[i] for i in rng.permutation(count)]
 
 
-def _before(wall: Wall, centre: Vector, setup: Setup, rng: np.random.Generator) -> Vector:
+def _before(wall: Upright, centre: Vector, setup: Setup, rng: np.random.Generator) -> Vector:
     """Return a random place for the flashlight before the wall.
 
     Raises:

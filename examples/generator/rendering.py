@@ -22,12 +22,14 @@ from .beam import WIDEST_DEG, beam, leds
 from .lens import Lens, lens_of
 from .options import Flashlight, Setup
 from .paint import albedo_of, outline, sheet, table_top
-from .poses import GOLDEN, PAPER_MM, Lamp, Viewpoint, Wall, wall_of
+from .poses import FLOOR_MM, GOLDEN, PAPER_MM, Lamp, Upright, Viewpoint, edge_of, wall_of
 from .sheet import GRID, lay
 
 Picture = Float[np.ndarray, "height width 3"]
 FINER = 2  # pinhole pixels per photo pixel and axis: resampling blurs half of one of them
 TABLE_MM = 1000.0  # half of its side
+FLOOR_SIDE_MM = 8000.0
+FLOOR_DARKER = 0.5  # than a table of stone
 WALL_MM = (3000.0, 2400.0)  # width and height
 WALL_BRIGHTER = 1.15  # than a plain table
 EMITTER_POINTS = 16  # of a round emitter, and of its way during the exposure: penumbras come in so many steps
@@ -85,10 +87,10 @@ def stage(setup: Setup, board: AnyBoard, thing: trimesh.Trimesh, camera: Camera,
         mi.set_variant("llvm_ad_rgb" if setup.exposure.llvm else "scalar_rgb")
     except ImportError as error:
         raise CaptureError(f"--llvm cannot be used: {error}. Leave it out.") from error
-    flat, gloss = np.zeros(2), (setup.table.varnish, setup.table.varnish_roughness)
-    top = _painted(table_top(setup.table.table, rng), *gloss)
+    top = _painted(table_top(setup.table.table, rng), setup.table.varnish, setup.table.varnish_roughness)
+    edge = edge_of(setup, thing)
     shapes = {
-        "table": mi.load_dict(_rectangle(flat, 2 * TABLE_MM * np.ones(2), -PAPER_MM) | {"bsdf": top}),
+        "table": _table(top) if edge is None else _table_to(edge, top),
         "board": _board(board, setup),
         "thing": _solid(thing, setup),
     }
@@ -96,6 +98,9 @@ def stage(setup: Setup, board: AnyBoard, thing: trimesh.Trimesh, camera: Camera,
     if wall is not None:
         paint = np.clip(WALL_BRIGHTER * table_top("plain", setup.stream("wall")), 0, 0.95)
         shapes["wall"] = mi.load_dict(_upright(wall, thing) | {"bsdf": _painted(paint)})
+    if edge is not None:
+        paint = _painted(FLOOR_DARKER * table_top("stone", setup.stream("floor")))
+        shapes["floor"] = mi.load_dict(_rectangle(np.zeros(2), FLOOR_SIDE_MM * np.ones(2), -FLOOR_MM) | {"bsdf": paint})
     return Stage(
         setup, board, thing, lens_of(camera, FINER), lens_of(camera, 1), shapes, _beam_picture(setup.flashlight)
     )
@@ -268,7 +273,20 @@ def _rectangle(middle: Float[np.ndarray, "2"], size: Float[np.ndarray, "2"], z: 
     return {"type": "rectangle", "to_world": place}
 
 
-def _upright(wall: Wall, thing: trimesh.Trimesh) -> dict[str, Any]:
+def _table(top: Any) -> Any:
+    return mi.load_dict(_rectangle(np.zeros(2), 2 * TABLE_MM * np.ones(2), -PAPER_MM) | {"bsdf": top})
+
+
+def _table_to(edge: Upright, top: Any) -> Any:
+    """Return a table that ends at its edge; its picture lies where that of a table without end does."""
+    along, across = TABLE_MM * np.cross([0, 0, 1], edge.normal), 2 * TABLE_MM * edge.normal
+    end = edge.offset * edge.normal - [0, 0, PAPER_MM]
+    corners = np.array([end - along, end + along, end + along + across, end - along + across])
+    mesh = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    return _mesh("table", mesh, {"type": "twosided", "bsdf": top}, uv=corners[:, :2] / (2 * TABLE_MM) + 0.5)
+
+
+def _upright(wall: Upright, thing: trimesh.Trimesh) -> dict[str, Any]:
     width, height = WALL_MM
     foot = thing.bounds.mean(0) * [1, 1, 0]
     middle = foot + (wall.offset - wall.normal @ foot) * wall.normal + [0, 0, height / 2 - PAPER_MM]

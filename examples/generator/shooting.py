@@ -96,7 +96,7 @@ def take_photos(out: Place, ready: Stage, fixed: poses.Viewpoint, rng: np.random
     setup = ready.setup
     count, novel = setup.flashlight.photos, setup.exposure.novel
     rays, laid = truth.Rays(ready.thing), lay(ready.board, setup)
-    seen = truth.seen(rays, fixed, setup, laid, poses.wall_of(setup, ready.thing))
+    seen = truth.seen(rays, fixed, setup, laid)
     if not seen.mask.any():
         raise CaptureError("the camera does not see the object. Change --elevation, --distance or --board-stays.")
     (out.truth / "shadow").mkdir(parents=True, exist_ok=True)

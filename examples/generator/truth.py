@@ -19,7 +19,7 @@ from .beam import WARM_WHITE, profile
 from .options import Setup
 from .paint import albedo_of
 from .pipeline import ORDER, Developed
-from .poses import LED_FROM_LENS_MM, PAPER_MM, Lamp, Viewpoint, Wall
+from .poses import FLOOR_MM, LED_FROM_LENS_MM, PAPER_MM, Lamp, Viewpoint, edge_of, wall_of
 from .rendering import BEAM_TEXELS, led_places
 from .sheet import Sheet
 
@@ -66,13 +66,18 @@ def camera_rays(camera: Camera, view: Viewpoint) -> tuple[Float[np.ndarray, "n 3
     return np.broadcast_to(view.world_from_camera.translation, along.shape), along
 
 
-def seen(rays: Rays, view: Viewpoint, setup: Setup, laid: Sheet, wall: Wall | None) -> Seen:
-    """Return depth, normals and mask from the fixed camera; behind the object are table, a board that stays, wall."""
+def seen(rays: Rays, view: Viewpoint, setup: Setup, laid: Sheet) -> Seen:
+    """Return depth, normals and mask from the fixed camera; behind the object are table, board, floor, wall."""
     camera = view.camera
     start, along = camera_rays(camera, view)
     depth = _on_table(start, along, laid if setup.table.board_stays else None)
     is_table = np.isfinite(depth)
     normals = np.tile([0.0, 0.0, 1.0], (len(along), 1))
+    edge, wall = edge_of(setup, rays.mesh), wall_of(setup, rays.mesh)
+    if edge is not None:
+        beyond = (start + np.where(is_table, depth, 0)[:, None] * along) @ edge.normal < edge.offset
+        is_floor = is_table & beyond
+        depth, is_table = np.where(is_floor, (-FLOOR_MM - start[:, 2]) / along[:, 2], depth), is_table & ~is_floor
     if wall is not None:
         towards = -(along @ wall.normal)
         to_wall = np.where(towards > 0, (start @ wall.normal - wall.offset) / np.maximum(towards, 1e-12), np.inf)
@@ -198,7 +203,7 @@ def view_json(view: Viewpoint) -> dict[str, Any]:
     }
 
 
-def write_scene(folder: Path, laid: Sheet, views: dict[str, Viewpoint], setup: Setup, wall: Wall | None) -> None:
+def write_scene(folder: Path, laid: Sheet, views: dict[str, Viewpoint], setup: Setup, thing: trimesh.Trimesh) -> None:
     """Write camera.json, board.json, board_photos.json, ground.json. The first of `views` is the tripod's."""
     board, fixed = laid.board, view_json(next(iter(views.values())))
     _write(folder / "camera.json", {"exif_orientation": 1, "upright": fixed, "stored": fixed})
@@ -221,8 +226,9 @@ def write_scene(folder: Path, laid: Sheet, views: dict[str, Viewpoint], setup: S
         entry["fixed_camera"] = i == 0
     _write(folder / "board_photos.json", photos)
     ground: dict[str, Any] = {"normal": [0, 0, 1], "offset_mm": -PAPER_MM}
-    if wall is not None:
-        ground["wall"] = {"normal": wall.normal.tolist(), "offset_mm": wall.offset}
+    for name, plane in (("wall", wall_of(setup, thing)), ("edge", edge_of(setup, thing))):
+        if plane is not None:
+            ground[name] = {"normal": plane.normal.tolist(), "offset_mm": plane.offset}
     _write(folder / "ground.json", ground)
 
 

@@ -16,7 +16,7 @@ from calibration.ground.contact_gaps import LIKELY as GAP
 from calibration.ground.contact_gaps import BareGround, without_gaps
 from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import LIKELY, find_shadows
-from calibration.ground.shadow_reach import shadow_reach
+from calibration.ground.table_edges import find_table_edges
 from reconstruct.labels.ground_test import (
     GAP_CONFIDENCE,
     NOISE_FLOOR,
@@ -28,12 +28,13 @@ from reconstruct.labels.ground_test import (
 )
 from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.multiple_lights import is_shared, split_on_ground
-from reconstruct.labels.outline import dilated, object_region
+from reconstruct.labels.outline import dilated, may_hold_shadow, object_region, reaches_border
 from reconstruct.scene import Scene, grey_irradiance, ground_points
 from reconstruct.shading.noise import Noise
 
 EXPLAINED = 0.7  # of the picture: a light model that makes ground of so much needs no other
 GAINED = 0.2  # of the picture: how much more of it the field must make ground
+QUIETER = 0.75  # of the field's noise on lit ground: a model with less knows the light
 FOLLOWS = 0.5  # share of the photos from which a pixel counts as ground of the field
 LIT, DARK = 0.7, 0.25  # visibility above and below which ground is called lit and in shadow
 GREY_CONFIDENCE = 0.3  # between them, where no shadow's edge runs through
@@ -41,10 +42,10 @@ TOO_DIM = 2.0  # log units below the photo's light near the object: the phone's 
 BRIGHT = 90.0  # per cent: the photo's light near the object
 NEAR = 1.0  # of the object's size in the picture: what is near it
 TONE_SHARE = 0.1  # one sigma of the object's brightness under a beam and a tone curve that nobody knows
+REACH_STEP = 4  # px between the points by which the table's edges are found
 BACKGROUND = 0.01  # of the picture: a smaller part that is no ground is a stain or a highlight
 SECTORS = 72  # of the view from the point below the camera, in which the ground ends at the nearest background
 NEAREST = 5.0  # per cent of a sector's background that may be nearer
-REACH_STEP = 4  # px
 CLEAR = 0.3  # mean log likelihood ratio of a photo that decides for sure
 TOO_BRIGHT, MANY = 0.5, 3  # log units: a highlight; in so many photos, ground whose albedo is that of its shadow
 AMBIENT_SHARE = 0.7  # of the light in shadows on the ground: the rest comes from the lit ground and the object
@@ -53,7 +54,8 @@ AMBIENT_SHARE = 0.7  # of the light in shadows on the ground: the rest comes fro
 def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     """Classify pixels as object or ground, and label the shadows on it: by the lights' model, or by a field of light.
 
-    The field is used where the model makes much less of the picture ground than the field does.
+    The field is used where the model makes much less of the picture ground than the field does, unless the model
+    explains all that lies before the table's edge.
 
     Args:
         before: of the same photos under other lights; what does not depend on them is taken from it.
@@ -65,14 +67,43 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
         return _by_field(scene, before.field)
     if is_shared(scene):
         return test_ground(split_on_ground(scene))
-    tested = test_ground(scene)
-    if before is not None or tested.explained >= EXPLAINED or scene.ground_depth is not None:
+    tested = test_ground(scene, None if before is None else before.background)
+    if before is not None or scene.ground_depth is not None:
         return tested
+    joined = scene.mask is None and reaches_border(tested.mask > 0.5)  # the object, perhaps, to what lies behind it
+    background = _beyond_table(scene, tested) if joined else None
+    by_model = tested if background is None else test_ground(scene, background)
+    if tested.explained >= EXPLAINED:
+        return by_model
     assert scene.rgb is not None
     rgb, usable = scene.rgb.numpy(), scene.usable.numpy()
     field = at_photo_size(fit_ground_field(rgb, usable), rgb, usable)
+    if by_model.explained >= EXPLAINED and by_model.noise.share < QUIETER * field.noise():
+        return by_model  # it explains all of the table, and better
     share = float((field.follows > FOLLOWS).mean())
-    return _by_field(scene, field) if share > tested.explained + GAINED else tested
+    return _by_field(scene, field) if share > tested.explained + GAINED else by_model
+
+
+def _beyond_table(scene: Scene, tested: GroundTest) -> Bool[Tensor, "height width"] | None:
+    """Return what is seen beyond the table's edges, without the object before it; None if the table has no end.
+
+    Floor and wall have a smooth field of light of their own, which the object does not follow. What is too dark in
+    nearly all photos is none of the object either.
+    """
+    assert scene.rgb is not None
+    points = ground_points(scene).double().numpy()
+    finite = np.isfinite(points[..., 0])
+    few = np.zeros_like(finite)
+    few[::REACH_STEP, ::REACH_STEP] = True
+    follows = (tested.albedo > 0).any(-1).numpy()
+    edges = find_table_edges(points[few & finite], follows[few & finite].astype(float), scene.eye.double().numpy())
+    if not edges:
+        return None
+    beyond = ~np.all([edge.on_table(points) for edge in edges], axis=0)
+    rgb, usable = scene.rgb.numpy(), scene.usable.numpy() & beyond
+    field = at_photo_size(fit_ground_field(rgb, usable), rgb, usable)
+    smooth = cv2.medianBlur(((field.follows > FOLLOWS) | (field.usable.sum(0) < MANY)).astype(np.uint8), 5) > 0
+    return torch.from_numpy(beyond & smooth)
 
 
 def _by_field(scene: Scene, field: GroundField) -> GroundTest:
@@ -82,7 +113,7 @@ def _by_field(scene: Scene, field: GroundField) -> GroundTest:
     points = ground_points(scene).double().numpy()
     visibility, confidence = _visibility(bare)
     trusted = _well_lit(bare.field, region) & ~_background(scene, bare, region, points)
-    trusted &= _reached(scene, region, points)
+    trusted &= may_hold_shadow(scene, mask > 0.5).numpy()
     beside = dilated(mask > 0.5, 2 * RIM + 1)
     confidence *= torch.from_numpy(trusted) * (1 - mask) * torch.where(beside, RIM_SHARE, 1.0)
     gain, scale = _gain(scene, bare.field, region)
@@ -170,21 +201,6 @@ def _background(
         if len(far):
             behind |= inside & (away > np.percentile(far, NEAREST))
     return behind & ~region
-
-
-def _reached(
-    scene: Scene, region: Bool[np.ndarray, "height width"], points: Float[np.ndarray, "height width 3"]
-) -> Bool[np.ndarray, "photos height width"]:
-    """Return the ground on which the object's shadow may fall: what is dark elsewhere is not its shadow."""
-    outline = points[region]
-    outline = outline[np.isfinite(outline[:, 0])]
-    if not len(outline):
-        return np.ones((len(scene.lights), *region.shape), bool)
-    few = points[::REACH_STEP, ::REACH_STEP]
-    lights = scene.lights.double().numpy()
-    reached = shadow_reach(scene.eye.double().numpy(), outline, lights, few)
-    size = region.shape[::-1]
-    return np.stack([cv2.resize(one.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) for one in reached]) > 0
 
 
 def _gain(

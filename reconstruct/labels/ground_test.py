@@ -1,6 +1,6 @@
 """Find the pixels that behave like the known ground under the known lights, and where that ground is lit."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,6 +16,7 @@ from reconstruct.labels.outline import (
     dilated,
     largest_near,
     local_mean,
+    may_hold_shadow,
     object_region,
     share_of_region,
 )
@@ -52,6 +53,7 @@ class GroundTest:
     albedo: Float[Tensor, "height width 3"]  # relative to Scene.power; 0 off the ground
     gain: Float[Tensor, "photos height width"]  # actual irradiance of the ground over the modelled one; near 1
     noise: Noise
+    background: Bool[Tensor, "height width"] | None = None  # neither object nor ground: beyond the table's edge
     explained: float = 1.0  # share of the pixels with light and ground to compare with that behave as ground
     field: GroundField | None = None  # of light, where it made the labels instead of the lights' model
     ambient: float = 0.0  # irradiance of everything but the light, as that field's shadows show it
@@ -81,13 +83,13 @@ class _Behaviour:
     ever_lit: Bool[Tensor, "height width"]
 
 
-def test_ground(scene: Scene) -> GroundTest:
+def test_ground(scene: Scene, background: Bool[Tensor, "height width"] | None = None) -> GroundTest:
     """Classify pixels as object or ground, and label the shadows on the ground.
 
     A ground pixel has two values: I_k = albedo * (irradiance_k + ambient) when lit, a small one in shadow. The albedo
     is the densest cluster of I_k / irradiance_k. A smooth gain per photo absorbs errors of its light model, so that a
     light that is off by a few per cent does not make the whole ground fail. Level tops of the object pass this test;
-    find_level_tops distinguishes them from the ground around. A given scene.mask is kept as it is.
+    find_level_tops tells them from the ground. A given scene.mask is kept; `background` is known to show neither.
 
     Raises:
         ValueError: the scene has no photos (scene.rgb is None).
@@ -95,17 +97,20 @@ def test_ground(scene: Scene) -> GroundTest:
     if scene.rgb is None:
         raise ValueError("the ground test needs photos; shadow pictures are labels already")
     behaves, gain, noise = _behaviour(scene)
+    if background is not None:
+        between, level = (torch.where(background, 0.0, image) for image in (behaves.between, behaves.level))
+        behaves = replace(behaves, between=between, level=level)
     mask, mask_confidence = _mask(scene, behaves)
     ground = (mask < 0.5) & behaves.known & (behaves.between < NOT_GROUND) & (behaves.level > 0)
     visibility, confidence = _visibility(behaves, ground, noise)
     albedo = torch.where((ground & behaves.ever_lit)[..., None], behaves.albedo, torch.zeros(()))
-    confidence *= 1 - mask
-    confidence *= mask_confidence > 0
+    confidence *= (1 - mask) * (mask_confidence > 0)
+    if scene.ground_depth is None:
+        confidence *= (visibility > 0.5) | may_hold_shadow(scene, mask > 0.5)
     if scene.mask is None:  # missed parts of the object lie beside the mask; a false lit pixel there would carve them
-        beside = dilated(mask > 0.5, 2 * RIM + 1)
-        confidence *= torch.where(beside, RIM_SHARE, 1.0)
+        confidence *= torch.where(dilated(mask > 0.5, 2 * RIM + 1), RIM_SHARE, 1.0)
     strange = float(((behaves.between >= NOT_GROUND) & behaves.known).sum() / behaves.known.sum().clamp(min=1))
-    return GroundTest(mask, mask_confidence, visibility, confidence, albedo, gain, noise, 1 - strange)
+    return GroundTest(mask, mask_confidence, visibility, confidence, albedo, gain, noise, background, 1 - strange)
 
 
 def _behaviour(scene: Scene) -> tuple[_Behaviour, Float[Tensor, "photos height width"], Noise]:

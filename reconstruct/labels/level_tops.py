@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from reconstruct.labels.outline import local_mean
+from reconstruct.labels.outline import local_mean, reaches_border
 from reconstruct.scene import Scene, grey_irradiance, ground_points
 
 LIT_BAND = 0.12  # a sample this close to what the height fitted so far predicts, as a logarithm, is lit
@@ -173,7 +173,7 @@ def find_level_tops(
         strange, strange_maybe = _strange(around, unlike[box])
         sure[box] = torch.from_numpy(raised | strange)
         doubtful[box] = torch.from_numpy((maybe | strange_maybe) & ~raised & ~strange)
-        if not _reaches_border((sure | doubtful)[box]):
+        if not reaches_border((sure | doubtful)[box]):
             break
     return LevelTops(sure, doubtful)
 
@@ -185,10 +185,6 @@ def _above_ground(found: Heights, region: Bool[Tensor, "h w"], radius: int) -> _
     known = found.height[border & found.sigma.isfinite()]
     base = float(known.median()) if len(known) else 0.0
     return _Surroundings((found.height - base).numpy(), found.sigma.numpy(), region.numpy(), radius)
-
-
-def _reaches_border(image: Bool[Tensor, "h w"]) -> bool:
-    return bool(image[0].any() | image[-1].any() | image[:, 0].any() | image[:, -1].any())
 
 
 def _box_around(region: Bool[Tensor, "height width"], radius: int) -> tuple[slice, slice]:

@@ -17,6 +17,7 @@ from skimage.segmentation import random_walker
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
+from calibration.ground.shadow_reach import shadow_reach
 from reconstruct.scene import Scene, ground_points
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import first_hits, visibility
@@ -37,6 +38,7 @@ IN_THE_DARK = 0.06  # of the object's brightness: no light falls on a background
 FEWEST = 0.02  # of the picture: a smaller bright part is a highlight or a lamp
 SPECK = 0.05  # of the largest bright part: smaller ones are noise
 HOLE = 0.002  # of the object: larger ones show the background
+REACH_STEP = 4  # px: each such pixel tells whether a shadow may reach the pixels around it
 
 
 @dataclass(frozen=True)
@@ -181,6 +183,32 @@ def object_region(
     fill = ~hole_touches & (small | (doubtful > 0.5 * hole_sizes))
     fill[0] = False
     return torch.from_numpy(region | fill[holes])
+
+
+def reaches_border(region: Bool[Tensor, "height width"]) -> bool:
+    """Return whether a region reaches the picture's border."""
+    return bool(region[0].any() or region[-1].any() or region[:, 0].any() or region[:, -1].any())
+
+
+def may_hold_shadow(scene: Scene, region: Bool[Tensor, "height width"]) -> Bool[Tensor, "photos height width"]:
+    """Return the ground on which the object's shadow may fall in each photo: what is dark elsewhere is not its shadow.
+
+    Dark there are ground behind the flashlight, what lies beyond the table's edge, and shadows of other things. All of
+    the picture is returned where the region is empty, or reaches its border: the rest of the object throws shadows too.
+
+    Args:
+        region: the object's pixels.
+    """
+    inside, every = region.numpy(), torch.ones(len(scene.lights), *region.shape, dtype=torch.bool)
+    points = ground_points(scene).double().numpy()
+    outline = points[inside]
+    outline = outline[np.isfinite(outline[:, 0])]
+    if not len(outline) or reaches_border(region):
+        return every
+    eye, lights = scene.eye.double().numpy(), scene.lights.double().numpy()
+    reached = shadow_reach(eye, outline, lights, points[::REACH_STEP, ::REACH_STEP]).astype(np.uint8)
+    size = inside.shape[::-1]
+    return torch.from_numpy(np.stack([cv2.resize(one, size, interpolation=cv2.INTER_NEAREST) for one in reached]) > 0)
 
 
 def local_mean(images: Float[Tensor, "n height width"], window: int) -> Float[Tensor, "n height width"]:
