@@ -12,6 +12,7 @@ OFF_AXIS = tuple(np.radians([0.0, 7.0, 14.0, 21.0, 28.0, 35.0]))  # of the rings
 PER_RING = 6  # trial axes on the first ring; the others have as many more
 EVERY = 3  # of the ground's cells: many, to tell two aims apart
 CLEARLY = 0.9  # of the residual with the present aim: better aims are taken
+POWER_VOTE = 0.1  # a flashlight 10 % brighter than the others counts like 1 % of misfit
 
 
 def looked_for_aims(
@@ -30,6 +31,7 @@ def looked_for_aims(
     thin = replace(cells, points=cells.points[some], rgb=cells.rgb[:, some], usable=cells.usable[:, some])
     thinned = Evidence(thin, evidence.height, evidence.log_grey[:, some], evidence.weight[:, some])
     targets, power = flashlights.targets.copy(), flashlights.log_power.copy()
+    common = float(np.median(power))
     for k in range(len(targets)) if photos is None else photos:
         use = thinned.weight[k] > 0
         if not use.any():
@@ -40,6 +42,7 @@ def looked_for_aims(
         residual = (thinned.log_grey[k] - level[some] - log_irradiance(state, thinned))[:, use]
         offset = np.median(residual, axis=1)
         size = np.median(np.abs(residual - offset[:, None]), axis=1)
+        size += POWER_VOTE * np.minimum(np.abs(offset - common), 1)
         best = int(np.argmin(size))
         if size[best] < CLEARLY * size[0]:
             targets[k], power[k] = trials[best], offset[best]

@@ -39,10 +39,8 @@ START_BEAM = 2.0  # cos^2: between a bare LED and a focused one
 REFIT_RESIDUAL = 2.0  # of the median photo: such a photo may sit in a wrong minimum
 GLOSS_ANGLE = np.radians(22.0)  # half angle below which a glossy table mirrors the light
 GLOSS_RISE = 0.03
-FOLLOWS, FOLLOWS_QUARTILES = (
-    0.03,
-    2.5,
-)  # log units; times the lower quartile of cells: nearer samples follow
+FOLLOWS = 0.03  # log units: samples nearer than this follow the model, ...
+FOLLOWS_QUARTILES = 2.5  # ... or nearer than this many lower quartiles over the cells
 OVAL_GAIN = 0.85  # of the residual: round beams keep 0.98, beams with 2 % of asymmetry at 40 degrees go to 0.5
 OVAL_PHOTOS = 8  # fewer leave the ground's albedo free enough to take the terms up
 

@@ -207,8 +207,9 @@ def may_hold_shadow(scene: Scene, region: Bool[Tensor, "height width"]) -> Bool[
         return every
     eye, lights = scene.eye.double().numpy(), scene.lights.double().numpy()
     reached = shadow_reach(eye, outline, lights, points[::REACH_STEP, ::REACH_STEP]).astype(np.uint8)
-    size = inside.shape[::-1]
-    return torch.from_numpy(np.stack([cv2.resize(one, size, interpolation=cv2.INTER_NEAREST) for one in reached]) > 0)
+    size, around = inside.shape[::-1], np.ones((3, 3), np.uint8)  # and the pixels between those that were asked
+    whole = [cv2.resize(cv2.dilate(one, around), size, interpolation=cv2.INTER_NEAREST) for one in reached]
+    return torch.from_numpy(np.stack(whole) > 0)
 
 
 def local_mean(images: Float[Tensor, "n height width"], window: int) -> Float[Tensor, "n height width"]:
