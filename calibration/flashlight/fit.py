@@ -17,7 +17,7 @@ from calibration.flashlight.model import (
     log_irradiance,
     refine,
 )
-from calibration.ground.table_edges import find_table_edges
+from calibration.ground.table_edges import find_table_edges, on_table
 from calibration.lights.ground_cells import GroundCells, sample_ground
 from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
@@ -275,9 +275,7 @@ def cells_on_table(fit: FlashlightFit) -> Bool[np.ndarray, " cells"]:
     size, seen = np.where(known, np.abs(fit.residual()), np.nan), known.any(0)
     near = max(FOLLOWS, FOLLOWS_QUARTILES * float(np.quantile(np.nanmedian(size[:, seen], axis=0), 0.25)))
     follows = (size[:, seen] < near).sum(0) / known[:, seen].sum(0)
-    inside = np.ones(len(cells.points), bool)
-    for edge in find_table_edges(cells.points[seen], follows, cells.eye):
-        inside &= edge.on_table(cells.points)
+    inside = on_table(find_table_edges(cells.points[seen], follows, cells.eye), cells.points)
     return inside if (inside & seen).sum() >= MIN_GROUND else np.ones_like(inside)
 
 

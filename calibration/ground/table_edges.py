@@ -5,6 +5,7 @@ ground's points into two classes by how well they follow the lights, with the la
 [Otsu 1979]; then a second one in what is left, and so on.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +32,14 @@ class TableEdge:
         return points[..., :2] @ self.normal > self.offset
 
 
+def on_table(edges: Sequence[TableEdge], points: Float[np.ndarray, "*points 3"]) -> Bool[np.ndarray, "*points"]:
+    """Return which points of the ground lie before all edges; all of them if there is none."""
+    inside = np.ones(points.shape[:-1], bool)
+    for edge in edges:
+        inside &= edge.on_table(points)
+    return inside
+
+
 def find_table_edges(
     points: Float[np.ndarray, "n 3"],
     follows: Float[np.ndarray, " n"],
@@ -52,10 +61,10 @@ def find_table_edges(
         left &= edge.on_table(points)
     for edge in tuple(edges):  # the first line of a corner cuts across the table
         others = [one for one in edges if one is not edge]
-        alone = np.all([one.on_table(points) for one in others], axis=0) & ~edge.on_table(points)
+        alone = on_table(others, points) & ~edge.on_table(points)
         if others and (not alone.any() or follows[alone].mean() > LARGEST_SHARE * follows[left].mean()):
             edges = others
-            left = np.all([one.on_table(points) for one in edges], axis=0)
+            left = on_table(edges, points)
     return tuple(edges)
 
 

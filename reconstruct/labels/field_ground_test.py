@@ -16,8 +16,9 @@ from calibration.ground.contact_gaps import LIKELY as GAP
 from calibration.ground.contact_gaps import BareGround, without_gaps
 from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import LIKELY, find_shadows
-from calibration.ground.table_edges import find_table_edges
+from calibration.ground.table_edges import find_table_edges, on_table
 from reconstruct.labels.ground_test import (
+    FEWEST_SAMPLES,
     GAP_CONFIDENCE,
     NOISE_FLOOR,
     PIXELS_AT_ONCE,
@@ -99,10 +100,12 @@ def _beyond_table(scene: Scene, tested: GroundTest) -> Bool[Tensor, "height widt
     edges = find_table_edges(points[few & finite], follows[few & finite].astype(float), scene.eye.double().numpy())
     if not edges:
         return None
-    beyond = ~np.all([edge.on_table(points) for edge in edges], axis=0)
+    beyond = ~on_table(edges, points)
     rgb, usable = scene.rgb.numpy(), scene.usable.numpy() & beyond
     field = at_photo_size(fit_ground_field(rgb, usable), rgb, usable)
-    smooth = cv2.medianBlur(((field.follows > FOLLOWS) | (field.usable.sum(0) < MANY)).astype(np.uint8), 5) > 0
+    smooth = (
+        cv2.medianBlur(((field.follows > FOLLOWS) | (field.usable.sum(0) < FEWEST_SAMPLES)).astype(np.uint8), 5) > 0
+    )
     return torch.from_numpy(beyond & smooth)
 
 

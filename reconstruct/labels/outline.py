@@ -199,12 +199,12 @@ def may_hold_shadow(scene: Scene, region: Bool[Tensor, "height width"]) -> Bool[
     Args:
         region: the object's pixels.
     """
-    inside, every = region.numpy(), torch.ones(len(scene.lights), *region.shape, dtype=torch.bool)
+    inside = region.numpy()
     points = ground_points(scene).double().numpy()
     outline = points[inside]
     outline = outline[np.isfinite(outline[:, 0])]
     if not len(outline) or reaches_border(region):
-        return every
+        return torch.ones(len(scene.lights), *region.shape, dtype=torch.bool)
     eye, lights = scene.eye.double().numpy(), scene.lights.double().numpy()
     reached = shadow_reach(eye, outline, lights, points[::REACH_STEP, ::REACH_STEP]).astype(np.uint8)
     size, around = inside.shape[::-1], np.ones((3, 3), np.uint8)  # and the pixels between those that were asked
