@@ -121,7 +121,7 @@ def wavy_capture(rng, blank, n_photos, with_exif):
     poses = [slanted(rng, tilt, away, middle) for tilt in tilts]
     photos = [edges_of(blank, camera, pose, size, heights, rng, 0.05) for pose in poses]
     fit = fit_camera(photos, SIZE, focal * (1 + 0.015 * rng.standard_normal()) if with_exif else None)
-    ground = fit_ground(fit.on_sheet(photos[0]), fit.camera, fit.first_pose())
+    ground = fit_ground(fit.on_sheet(photos[0]), fit.camera, fit.pose_spread(0))
     tilt = np.arccos(min(1.0, float(ground.world_from_camera.rotation[2] @ poses[0].rotation[2])))
     height = ground.world_from_camera.translation[2] - poses[0].translation[2]
     return [

@@ -81,7 +81,7 @@ def outcome(seed, size_mm):
         photos.append(Corners(pixels[inside], points[inside], board))
     exif = focal * np.exp(rng.normal(0, 0.02)) * FULL_FRAME_DIAGONAL / np.hypot(*SIZE)
     fit = fit_camera(photos, SIZE, exif)
-    ground = fit_ground(fit.on_sheet(photos[0]), fit.camera, fit.first_pose())
+    ground = fit_ground(fit.on_sheet(photos[0]), fit.camera, fit.pose_spread(0))
     return Outcome(fit, ground, camera, poses[0])
 
 

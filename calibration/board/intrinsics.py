@@ -56,10 +56,6 @@ class CameraFit:
         """How far the highest corner lies above the lowest, mm; 0: the sheet is flat."""
         return float(np.ptp(self.solution.heights()))
 
-    def first_pose(self) -> PoseSpread:
-        """How well the pose of the first photo, the tripod's, and the table under the sheet are known."""
-        return self.pose_spread(0)
-
     def pose_spread(self, index: int) -> PoseSpread:
         """How well the pose of a detection that is used, and the table under the sheet are known."""
         sheet, waves = self.solution.sheet, self.solution.waves

@@ -123,17 +123,13 @@ def align(first: SeenSurface, turned: SeenSurface, seed: int = 0) -> Alignment:
     """
     found = _refined(first, turned, _coarse(first, turned, seed), seed)
     pairs = _Pairs(first, turned, MOST_POINTS, seed)
-    best, by_colour = _best(pairs, found)
-    best = pairs.fitted(best, CLOSE * pairs.voxel, STEPS)
-    distance = float(np.median(pairs.distances(best)))
-    if distance > FITS * pairs.voxel:
-        raise ReconstructionError(
-            f"{turned.name}: laid on {first.name or 'the other lie'} in the best of {ROTATIONS} rotations, the "
-            f"surfaces are {distance:.2g} mm apart (median); at most {FITS * pairs.voxel:.2g} mm were needed. Is it "
-            "the same object, and did it keep its shape?"
-        )
+    alike = _best_by_shape(pairs, found)
+    best, distance = _closely(pairs, alike[0])  # before colour: what fits badly may fit badly in many ways
+    if len(alike) > 1:
+        best, distance = _closely(pairs, _best_by_colour(pairs, alike))
     colour = pairs.colour_errors(best)
-    return Alignment(best, distance, float(np.nanmedian(colour)) if np.isfinite(colour).any() else np.nan, by_colour)
+    seen = float(np.nanmedian(colour)) if np.isfinite(colour).any() else np.nan
+    return Alignment(best, distance, seen, len(alike) > 1)
 
 
 class _Pairs:
@@ -258,30 +254,50 @@ def _is_same(a: Pose, b: Pose, centre: Float[np.ndarray, "3"], size: float) -> b
     return bool(angle_between(a.rotation, b.rotation) < DISTINCT and shift < DISTINCT_SHIFT * size)
 
 
-def _best(pairs: _Pairs, found: list[Pose]) -> tuple[Pose, bool]:
-    """Return the motion that fits best, and whether colour decided.
-
-    Raises:
-        ReconstructionError: another fits equally well, in shape and in colour.
-    """
+def _best_by_shape(pairs: _Pairs, found: list[Pose]) -> list[Pose]:
+    """Return the motion that fits best, then all others that fit equally well within the noise."""
     width, blocks = 2 * CLOSE * pairs.voxel, pairs.blocks()
     losses = [pairs.losses(pose, width) for pose in found]
     first = int(np.argmin([loss.mean() for loss in losses]))
-    alike = []
+    alike = [found[first]]
     for k, loss in enumerate(losses):
         difference, noise = mean_difference(loss, losses[first], blocks)
-        if k == first or difference <= SIGMAS * noise:
-            alike.append(k)
-    if len(alike) == 1:
-        return found[first], False
-    colours = {k: pairs.colour_errors(found[k]) for k in alike}
-    means = {k: float(np.nanmean(error)) if np.isfinite(error).any() else np.inf for k, error in colours.items()}
-    chosen = min(alike, key=lambda k: means[k])
-    for k in alike:
-        difference, noise = mean_difference(colours[k], colours[chosen], blocks)
+        if k != first and difference <= SIGMAS * noise:
+            alike.append(found[k])
+    return alike
+
+
+def _closely(pairs: _Pairs, motion: Pose) -> tuple[Pose, float]:
+    """Return a motion fitted to all points, and their median distance from the other surface.
+
+    Raises:
+        ReconstructionError: the surfaces are too far apart to be the same object's.
+    """
+    motion = pairs.fitted(motion, CLOSE * pairs.voxel, STEPS)
+    distance, most = float(np.median(pairs.distances(motion))), FITS * pairs.voxel
+    if distance > most:
+        raise ReconstructionError(
+            f"{pairs.turned.name}: laid on {pairs.first.name or 'the other lie'} in the best of {ROTATIONS} rotations, "
+            f"the surfaces are {distance:.2g} mm apart (median); at most {most:.2g} mm were needed. Is it the same "
+            "object, and did it keep its shape?"
+        )
+    return motion, distance
+
+
+def _best_by_colour(pairs: _Pairs, alike: list[Pose]) -> Pose:
+    """Return the motion under which colours agree best, of those that fit equally well in shape.
+
+    Raises:
+        ReconstructionError: another fits equally well in colour, too.
+    """
+    blocks, colours = pairs.blocks(), [pairs.colour_errors(pose) for pose in alike]
+    means = [float(np.nanmean(error)) if np.isfinite(error).any() else np.inf for error in colours]
+    chosen = int(np.argmin(means))
+    for k, error in enumerate(colours):
+        difference, noise = mean_difference(error, colours[chosen], blocks)
         if k != chosen and difference <= SIGMAS * noise:
-            raise ReconstructionError(_ambiguous(pairs, found[chosen], found[k]))
-    return found[chosen], True
+            raise ReconstructionError(_ambiguous(pairs, alike[chosen], alike[k]))
+    return alike[chosen]
 
 
 def _ambiguous(pairs: _Pairs, a: Pose, b: Pose) -> str:
