@@ -5,8 +5,9 @@ import lit_table
 import numpy as np
 import pytest
 
-from calibration.flashlight.light_estimate import locate_lights
-from calibration.flashlight.tone_curve import OTHER_CURVES, ToneTest
+from calibration.flashlight.fit import collect, first_guess, fit_flashlights
+from calibration.flashlight.light_estimate import free_tangent, locate_lights
+from calibration.flashlight.tone_curve import OTHER_CURVES, ToneTest, compare_curves
 from capture.checks.check_stack import white_balance_finding
 from capture.errors import CaptureError
 from capture.photos.photo import decode_srgb
@@ -120,3 +121,14 @@ def test_nothing_is_said_against_srgb_unless_another_curve_is_clearly_better():
     assert not ToneTest(shown | {"BT.709": 0.00191}, *moved).error().any()
     flatter = ToneTest(shown | {"BT.709": 0.0022, "a flatter curve": 0.0021}, *moved)
     np.testing.assert_allclose(flatter.error(), [1.5, 2.0])  # true sRGB fits worse by more when it is decoded flatter
+
+
+def test_of_linear_photos_no_curve_is_doubted_and_no_light_less_certain():
+    truth = flashlight_photos.photograph(flashlight_photos.Recipe(n_photos=6))
+    evidence, _ = collect(
+        replace(truth.stack, rgb=on_bt709(truth.stack.rgb)), flashlight_photos.POSED_CAMERA, np.ones(6, bool)
+    )
+    fit = fit_flashlights(first_guess(evidence), evidence, free_tangent)
+    assert compare_curves(fit, np.ones(6), is_linear=False).error().any()
+    found = compare_curves(fit, np.ones(6), is_linear=True)
+    assert list(found.residuals) == ["linear"] and found.sentence() == "" and not found.error().any()

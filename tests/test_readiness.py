@@ -198,11 +198,10 @@ def test_doubts_and_dropped_photos_are_reasons(truth, cover):
     assert "the tone curve is doubtful" in found.reasons
 
 
-def test_a_doubtful_tone_curve_is_said_of_encoded_photos_only(truth):
+def test_a_doubtful_tone_curve_is_said(truth):
     doubted = replace(truth.calibration, residuals={"tone": {"doubt": "tone curve: BT.709 fits better"}})
-    assert tone_doubts(truth.stack, doubted) == ("tone curve: BT.709 fits better",)
-    assert tone_doubts(truth.stack, truth.calibration) == ()
-    assert tone_doubts(replace(truth.stack, is_linear=True), doubted) == ()
+    assert tone_doubts(doubted) == ("tone curve: BT.709 fits better",)
+    assert tone_doubts(truth.calibration) == ()
 
 
 def test_the_page_and_the_terminal_say_it_all(truth, cover, tmp_path):

@@ -239,7 +239,7 @@ def locate_lights(
     fit = without_gloss(fit)
     fit = with_oval_beams(refit_outliers(fit), evidence)
     names = [stack.paths[k].name for k in photos]
-    tone = compare_curves(fit, np.array(stack.gains)[photos])
+    tone = compare_curves(fit, np.array(stack.gains)[photos], stack.is_linear)
     floor = np.hypot(unseen_error(fit), WORST_STEPS * tone.error())
     found = describe(fit, names, floor, *position_sigma(fit))
     found = replace(found, residuals=found.residuals | {"tone": tone.document(), "cue": BY_SHADING})

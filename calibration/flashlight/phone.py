@@ -86,7 +86,7 @@ def locate_lights_from_phone(
     lens_error = lens.camera.sigmas["fx"] / lens.camera.fx * carried.reach  # a longer lens stands farther away
     fit, offset_error, choice = _fit(carried, alone, views, float(np.median(lens_error[carried.posed()])))
     floor = np.where(carried.posed(), np.hypot(offset_error, lens_error), unseen_error(fit))
-    tone = compare_curves(fit, np.array(stack.gains)[photos])
+    tone = compare_curves(fit, np.array(stack.gains)[photos], stack.is_linear)
     names, floor = [stack.paths[k].name for k in photos], np.hypot(floor, WORST_STEPS * tone.error())
     found = describe(fit, names, floor, *position_sigma(fit))
     residuals = (

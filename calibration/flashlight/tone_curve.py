@@ -33,29 +33,29 @@ Linear = Float[np.ndarray, "*shape"]
 class ToneTest:
     """The light fit's residual (relative) under each curve, and how far the lights move under the best of them."""
 
-    residuals: dict[str, float]
+    residuals: dict[str, float]  # of the assumed curve first; of linear photos no other
     moved: Float[np.ndarray, " photos"]  # each light, from the assumed curve to the other curve that fits best
     moved_flatter: Float[np.ndarray, " photos"]  # ... to the flatter curve
 
     def best(self) -> str:
-        """Return the accepted curve: sRGB unless another one is clearly better."""
-        other = self._best_other()
-        return other if self.residuals[other] < CLEARLY_BETTER * self.residuals["sRGB"] else "sRGB"
+        """Return the accepted curve: the assumed one unless another one is clearly better."""
+        other, assumed = self._best_other(), self._assumed()
+        return other if self.residuals[other] < CLEARLY_BETTER * self.residuals[assumed] else assumed
 
     def error(self) -> Float[np.ndarray, " photos"]:
-        """Return the possible error of each light because of the curve; zero if nothing contradicts sRGB."""
+        """Return the possible error of each light because of the curve; zero if nothing contradicts it."""
         by_best = self._doubt(self._best_other(), CLEARLY_BETTER, HARDLY_BETTER) * self.moved
         return np.maximum(by_best, self._doubt(FLAT, *FLATTER_LIMITS) * self.moved_flatter)
 
     def _doubt(self, name: str, clearly: float, hardly: float) -> float:
-        """Of sRGB, from 0 to 1, by a curve whose residual over that of sRGB lies between two limits."""
-        ratio = self.residuals[name] / max(self.residuals["sRGB"], 1e-12)
+        """Of the assumed curve, from 0 to 1, by one whose residual over its own lies between two limits."""
+        ratio = self.residuals.get(name, np.inf) / max(self.residuals[self._assumed()], 1e-12)
         return float(np.clip((hardly - ratio) / (hardly - clearly), 0, 1))
 
     def sentence(self) -> str:
         """Return a sentence for the user; empty if nothing contradicts the assumption."""
         best = self.best()
-        if best == "sRGB":
+        if best == self._assumed():
             return ""
         return (
             f"tone curve: the ground's shading fits {best} better than the sRGB curve that was assumed "
@@ -67,8 +67,13 @@ class ToneTest:
         """Return the entry for calibration.json and for the assessment of the capture."""
         return {"residuals": self.residuals, "doubt": self.sentence()}
 
+    def _assumed(self) -> str:
+        return next(iter(self.residuals))
+
     def _best_other(self) -> str:
-        return min((name for name in self.residuals if name != "sRGB"), key=lambda name: self.residuals[name])
+        """Return the curve that fits best beside the assumed one; that one itself if no other was tried."""
+        _, *others = self.residuals
+        return min(others, key=lambda name: self.residuals[name], default=self._assumed())
 
 
 def _from_bt709(encoded: Linear) -> Linear:
@@ -83,13 +88,17 @@ OTHER_CURVES: dict[str, Callable[[Linear], Linear]] = {
 }
 
 
-def compare_curves(fit: FlashlightFit, gains: Float[np.ndarray, " photos"]) -> ToneTest:
+def compare_curves(fit: FlashlightFit, gains: Float[np.ndarray, " photos"], is_linear: bool) -> ToneTest:
     """Refit the flashlights from their current places, with the ground's brightness decoded by every other curve.
 
     Args:
-        fit: of photos decoded by the sRGB curve.
+        fit: of photos that are linear or were decoded by the sRGB curve.
         gains: what each photo was divided by.
+        is_linear: the photos hold linear numbers: no curve was assumed, and none is doubted.
     """
+    if is_linear:
+        still = np.zeros(len(gains))
+        return ToneTest({"linear": _residual(fit)}, still, still)
     residuals = {"sRGB": _residual(fit)}
     moved: dict[str, Float[np.ndarray, " photos"]] = {}
     for name, curve in OTHER_CURVES.items():

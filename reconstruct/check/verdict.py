@@ -137,7 +137,7 @@ def _check_view(source: Source, photos: Photos, calibration: Calibration, is_par
             f"({shown}; ...). Photograph in a dark room, camera still, flashlight in other places."
         )
     cover = shadow_cover(build_scene(stack, calibration, LONG_SIDE, mask=photos.mask))
-    doubts = tone_doubts(stack, calibration) if source.session is not None else ()
+    doubts = tone_doubts(calibration) if source.session is not None else ()
     doubts = (*doubts, *map(str, calibration.residuals.get("doubts", [])))
     findings = with_power_changes(photos.findings, calibration, stack)
     readiness = judge(calibration, findings, cover, doubts, is_part)
@@ -183,8 +183,8 @@ def _power_doubt(light: Light, calibration: Calibration) -> float:
     return 2 * POWER_SIGMAS * float(np.linalg.norm(light.sigma)) / distance
 
 
-def tone_doubts(stack: PhotoStack, calibration: Calibration) -> tuple[str, ...]:
-    """Return doubts about the assumed tone curve that follow from the ground's shading; none for linear photos."""
+def tone_doubts(calibration: Calibration) -> tuple[str, ...]:
+    """Return doubts about the assumed tone curve that follow from the ground's shading."""
     tested = calibration.residuals.get("tone")
     doubt = str(tested["doubt"]) if isinstance(tested, dict) else ""
-    return (doubt,) if doubt and not stack.is_linear else ()
+    return (doubt,) if doubt else ()
