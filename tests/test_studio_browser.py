@@ -99,6 +99,23 @@ def test_the_keyboard_alone_makes_renames_and_deletes_a_capture(browser, tmp_pat
     assert not (tmp_path / "captures" / "Blue-vase").exists()
 
 
+def test_back_closes_a_dialog_with_the_page_that_opened_it(browser, tmp_path):
+    capture_in(tmp_path, "vase")
+    with served(tmp_path) as (_, _, owner):
+        tab, bad = opened(browser, owner, PHONE)
+        for words in ("Rename", "Show on a screen"):
+            tab.click(".card a.face")
+            tab.wait_for_selector("text=Are the photos good?")
+            tab.click("summary:has-text('Board')")
+            tab.click(f"button:has-text('{words}')")
+            tab.wait_for_selector("dialog")
+            tab.go_back()
+            tab.wait_for_selector(".card")
+            assert not tab.query_selector("dialog")
+        assert not bad
+    assert not (tmp_path / ".studio" / "notes.json").exists()
+
+
 def test_names_of_strangers_are_text_and_mistakes_are_sentences(browser, tmp_path):
     evil = '<img src=x onerror="document.title=1">'
     capture_in(tmp_path, "vase")

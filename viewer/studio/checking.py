@@ -125,7 +125,7 @@ class Checks:
         place = self._place(capture)
         place.mkdir(parents=True, exist_ok=True)
         words = [*PROGRAM, "check", str(capture), "--out", str(place)]
-        self._process = (capture, mark, start_command(words, place / LOG))
+        self._process = (capture, mark, start_command(words, place / LOG, gives_way=True))
 
     def _note_end(self) -> None:
         assert self._process is not None

@@ -14,6 +14,9 @@ _RULES = (
     (r"Measure a square and write it into --board\b", 'Measure a square and say it under "Board" ("Another board")'),
     (r" \(shadowgraph board\)", ' ("Board" prints one)'),
     (r"Put it into board/, or name it in session\.toml: roles = \{[^}]*\}", 'Choose "board" below its picture'),
+    (r"and put (the|that) photo into board/", 'and choose "board" below its picture'),
+    (r"Put (it|one) into (its folder )?board/", 'Choose "board" below its picture'),
+    (r"Put them into its folder light/", 'Choose "light\'s phone" below their pictures'),
     # lights
     (r"need a file of lights \(--lights FILE\)", "need a file of lights, dropped with them,"),
     (r"a file of lights \(--lights FILE\.lp\) gives them", "a file of lights, dropped with them, gives them"),

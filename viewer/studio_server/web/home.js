@@ -117,9 +117,10 @@ export function home(_, again) {
   function trash(deleted) {
     if (!deleted.length) return null;
     const total = deleted.reduce((sum, one) => sum + one.bytes, 0);
-    return h("details", { class: "panel", key: "trash" }, h("summary", {}, `Trash: ${plural(deleted.length, "thing")}, ${bytes(total)}`),
-      h("ul", { class: "plain" }, deleted.map((one) => h("li", { key: one.id }, `${one.title} (${bytes(one.bytes)}, ${day(one.when)}) `,
-        h("button", { onclick: () => attempt(async () => { await change("restore", { id: one.id }); again(); }) }, "Put back")))),
+    return h("details", { class: "panel trash", key: "trash" }, h("summary", {}, `Trash: ${plural(deleted.length, "thing")}, ${bytes(total)}`),
+      h("ul", { class: "plain" }, deleted.map((one) => h("li", { key: one.id },
+        h("span", { class: "grow" }, one.title, " ", h("span", { class: "quiet small" }, `${bytes(one.bytes)}, ${day(one.when)}`)),
+        h("button", { "aria-label": `Put back: ${one.title}`, onclick: () => attempt(async () => { await change("restore", { id: one.id }); again(); }) }, "Put back")))),
       h("button", { class: "danger", onclick: () => attempt(async () => {
         if (await dialog("Empty the trash?", `${bytes(total)} are deleted for good.`, "Delete for good", { isDanger: true })) {
           toast(`${bytes(await change("empty_trash"))} freed.`);
