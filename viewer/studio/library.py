@@ -133,6 +133,7 @@ class Library:
             "state": state,
             "count": len(photos) + len(clips_of(path)),
             "coming": len(under_way),
+            "stalled": len(self._parts.stalled(key)),
             "coming_bytes": sum(part.size for part in under_way),
             "here_bytes": sum(self._parts.offset(part) for part in under_way),
             "verdict": check["verdict"],

@@ -51,13 +51,20 @@ export function capture(name, again) {
       } },
         h("p", {}, "Drop photos, a folder, a .zip or a clip here: the board in room light, and the object under the flashlight."),
         h("div", { class: "bar" }, chooser("Choose files", {}), chooser("Choose a folder", { webkitdirectory: true }), phone.button())),
-      phone.panel(), sending(sender),
+      phone.panel(), sending(sender), row.stalled > 0 && stalled(row),
       row.refused.length > 0 && h("div", { class: "bad small" }, h("p", {}, "Not taken:"),
         h("ul", { class: "plain" }, row.refused.slice(-5).map((one) => h("li", {}, `${one.name.split("/").pop()}: ${one.why}`)))),
       row.photos.length + row.clips.length > 0 && h("p", { class: "quiet" }, counts(row)),
       bad.length > 0 && h("p", { class: "warn" }, `Take again: ${bad.slice(0, 4).map((photo) => `${photo.name} (${photo.remarks[0][0]})`).join(", ")}`),
       row.clips.map((clip) => h("p", { key: clip }, `Clip: ${clip}`)),
       h("ul", { class: "photos" }, row.photos.map((photo) => thumb(row, photo))));
+  }
+
+  /** Files whose sender has left in the middle: they keep a run from starting. */
+  function stalled(row) {
+    return h("div", { class: "warn", key: "stalled" },
+      h("p", {}, `${plural(row.stalled, "file")} stopped in the middle: the phone or page that sends ${row.stalled === 1 ? "it" : "them"} has left, or lost the network. Sending goes on by itself when it is back.`),
+      h("button", { onclick: () => attempt(async () => { await change("go_on_without", { key: row.key }); again(); }) }, "Go on without"));
   }
 
   function chooser(words, more) {

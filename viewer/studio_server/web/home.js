@@ -81,7 +81,8 @@ export function home(_, again) {
 
   function words(card, run, state) {
     if (state === "arriving" && card.coming) {
-      return h("p", { class: "small" }, `${plural(card.coming, "file")} on the way, ${bytes(card.here_bytes)} of ${bytes(card.coming_bytes)} here`);
+      return h("p", { class: "small" }, `${plural(card.coming, "file")} on the way, ${bytes(card.here_bytes)} of ${bytes(card.coming_bytes)} here`,
+        card.stalled > 0 && h("span", { class: "warn" }, "; stopped in the middle: the sender has left"));
     }
     if (state === "running") {
       const left = run.progress.left_s;

@@ -62,7 +62,8 @@ export function run(name, again) {
       one.verdict_sentence && h("p", {}, one.verdict_sentence),
       one.warnings.length > 0 && h("details", { class: "panel" }, h("summary", { class: "warn" }, plural(one.warnings.length, "remark")),
         h("ul", { class: "plain" }, one.warnings.map((text) => h("li", {}, text)))),
-      h("div", { class: "bar" }, one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report"),
+      h("div", { class: "bar" }, one.has_mesh && h("a", { class: "button", href: stageOf(one), target: "_blank", rel: "noopener" }, "Fill the window"),
+        one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report"),
         h("button", { onclick: () => inspect(one) }, "Inspect in 3D")),
       one.has_mesh && saver.panel());
   }
@@ -124,9 +125,11 @@ function watch(name) {
   };
 }
 
+const stageOf = (one) => `/stage/${one.key.split("/").map(key).join("/")}/`;
+
 /** The stage of a run; one that the run has not packed is packed at the first look. */
 function frame(one) {
-  const address = `/stage/${one.key.split("/").map(key).join("/")}/`;
+  const address = stageOf(one);
   const element = h("iframe", { class: "result", title: `${one.title}, to relight and turn`, key: `${address} ${one.date}`,
     sandbox: "allow-scripts allow-same-origin allow-downloads" });
   element.stays = true;
