@@ -1,5 +1,7 @@
 """Two windows that look at one run: what one does with light and layers is not seen in the other."""
 
+import gc
+import weakref
 from pathlib import Path
 
 import fake_run
@@ -30,15 +32,17 @@ def test_what_one_visitor_switches_the_other_does_not_see_and_who_leaves_is_forg
         for number in range(2):
             tabs.append(open_page(browser, address, is_drawn=False)[0])
             polled(lambda number=number: len(visitors.pages) == number + 1)
-        first, second = visitors.pages.values()
-        polled(lambda: first.tabs.result_panels and second.tabs.result_panels)
+        pages = list(visitors.pages.values())
+        polled(lambda: all(page.tabs.result_panels for page in pages))
         tabs[0].get_by_text("Show", exact=True).click()
         tabs[0].get_by_label("Surface").uncheck()
-        polled(lambda: not first.controls.shows("Surface"))
-        assert second.controls.shows("Surface")
-        assert first._final_mesh is second._final_mesh  # read once
+        polled(lambda: not pages[0].controls.shows("Surface"))
+        assert pages[1].controls.shows("Surface")
+        assert pages[0]._final_mesh is pages[1]._final_mesh  # read once
+        gone = weakref.ref(pages.pop(0))
         tabs[0].close()
-        polled(lambda: list(visitors.pages.values()) == [second])
+        polled(lambda: list(visitors.pages.values()) == pages)
+        polled(lambda: gc.collect() and gone() is None)  # nothing keeps what was shown to one who has left
         assert visitors.is_over
         tabs[1].close()
         polled(lambda: not visitors.pages)
