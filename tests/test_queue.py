@@ -99,7 +99,9 @@ def test_a_job_can_be_stopped_while_it_waits_and_while_it_runs_and_taken_up_agai
     running, waiting = (queue.add(task(tmp_path, name, "30")) for name in ("running", "waiting"))
     queue.tick()
     queue.stop(waiting.id)
-    ticked_until(queue, (tmp_path / "runs" / "running" / "began").is_file)
+    began = tmp_path / "runs" / "running" / "began"
+    ticked_until(queue, lambda: began.is_file() and began.read_text())
+    assert psutil.Process(int(began.read_text())).nice() > psutil.Process().nice()  # it gives way to the page
     queue.stop(running.id)
     ticked_until(queue, lambda: set(states(queue).values()) == {STOPPED})
     queue.again(running.id)

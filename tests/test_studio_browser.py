@@ -1,5 +1,6 @@
 """The studio in a browser: with the mouse alone, with the keyboard alone, and on a phone's screen."""
 
+import os
 from pathlib import Path
 
 import finished_run
@@ -97,6 +98,41 @@ def test_the_keyboard_alone_makes_renames_and_deletes_a_capture(browser, tmp_pat
         tab.wait_for_selector("text=Trash: 1 thing")
         assert not bad
     assert not (tmp_path / "captures" / "Blue-vase").exists()
+
+
+def test_a_phone_that_left_in_the_middle_is_said_on_the_page_and_can_be_gone_on_without(browser, tmp_path):
+    capture_in(tmp_path, "vase")
+    with served(tmp_path) as (_, _, owner):
+        address = owner.create("vase", "IMG_9.jpg", 3000).headers["Location"]
+        owner.piece(address, 0, jpeg(9)[:1000])
+        (file,) = (tmp_path / ".studio" / "uploads").glob("*.part")
+        os.utime(file, (1e9, 1e9))
+        tab, bad = opened(browser, owner, PHONE)
+        tab.wait_for_selector("text=stopped in the middle: the sender has left")
+        tab.click(".card a.face")
+        tab.wait_for_selector("text=Starts once all photos are here.")
+        assert not tab.evaluate(RULES)
+        tab.click("text=Go on without")
+        tab.wait_for_selector("text=Go on without", state="detached")
+        tab.wait_for_selector("button:has-text('Start'):not([disabled])")
+        assert not bad
+
+
+def test_back_closes_a_dialog_with_the_page_that_opened_it(browser, tmp_path):
+    capture_in(tmp_path, "vase")
+    with served(tmp_path) as (_, _, owner):
+        tab, bad = opened(browser, owner, PHONE)
+        for words in ("Rename", "Show on a screen"):
+            tab.click(".card a.face")
+            tab.wait_for_selector("text=Are the photos good?")
+            tab.click("summary:has-text('Board')")
+            tab.click(f"button:has-text('{words}')")
+            tab.wait_for_selector("dialog")
+            tab.go_back()
+            tab.wait_for_selector(".card")
+            assert not tab.query_selector("dialog")
+        assert not bad
+    assert not (tmp_path / ".studio" / "notes.json").exists()
 
 
 def test_names_of_strangers_are_text_and_mistakes_are_sentences(browser, tmp_path):

@@ -1,12 +1,14 @@
 """Photos over a network that breaks, to a server that is killed: none is lost, none is there twice."""
 
 import hashlib
+import os
 import socket
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from studio_client import Client, Process
+from studio_client import Client, Process, served
 
 MOST_TRIES = 50
 PIECE = 1 << 20
@@ -77,6 +79,26 @@ def test_photos_arrive_whole_and_once_though_connections_drop_and_the_server_is_
     files = photos(6, 1 << 20)
     assert send_all(tmp_path, files, drops=3, kills=1) == (3, 1)
     check(tmp_path, files)
+
+
+def test_a_phone_that_leaves_in_the_middle_holds_nothing_up_and_loses_nothing_when_it_is_back(tmp_path):
+    ((name, content),) = photos(1, 3000).items()
+    with served(tmp_path) as (studio, _, owner):
+        key = owner.ok("new", title="vase")
+        address = owner.create(key, name, len(content)).headers["Location"]
+        assert owner.piece(address, 0, content[:1000]).status == 204
+        row = owner.get(f"/api/capture?key={key}")[1]
+        assert (row["coming"], row["stalled"]) == (1, 0)
+        owner.ok("go_on_without", key=key)  # what still comes is kept
+        (file,) = (tmp_path / ".studio" / "uploads").glob("*.part")
+        os.utime(file, (time.time() - 60,) * 2)
+        row = owner.get(f"/api/capture?key={key}")[1]
+        assert (row["coming"], row["stalled"]) == (1, 1)
+        owner.ok("go_on_without", key=key)
+        assert owner.get(f"/api/capture?key={key}")[1]["coming"] == 0
+        assert owner.raw("HEAD", address).status == 404  # the phone is back, and begins anew
+        assert owner.send(key, name, content).status == 204
+        assert (studio.folder.capture(key) / name).read_bytes() == content
 
 
 @pytest.mark.slow  # the bar: 40 photos of 12 megapixels, ten drops, two kills

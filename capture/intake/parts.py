@@ -31,6 +31,7 @@ from capture.session.session import ROLE_FOLDERS
 from capture.session.write_settings import set_role
 
 MOST_UNDER_WAY = 4_000  # files: a folder dropped twice
+STALLED_S = 30.0  # without a byte: whoever sends the file has left, or its network has
 FORGOTTEN_S = 24 * 3600.0  # after which an abandoned file is removed
 ARCHIVE = ".zip"
 LARGEST_ARCHIVE = 16 << 30  # bytes
@@ -121,6 +122,11 @@ class Parts:
     def under_way(self, capture: str) -> list[Part]:
         """Return the files of a capture that have not arrived yet."""
         return [part for part in list(self._known.values()) if part.capture == capture and not part.is_over]
+
+    def stalled(self, capture: str) -> list[Part]:
+        """Return the files of a capture that stopped in the middle; each goes on when its sender is back."""
+        then = time.time() - STALLED_S
+        return [p for p in self.under_way(capture) if self.offset(p) < p.size and self._touched(p) < then]
 
     def of(self, capture: str) -> list[Part]:
         """Return every file that was sent to a capture and is remembered."""

@@ -5,6 +5,7 @@ identified by their folder's name: the same command continues an interrupted bat
 changed, and leaves the rest alone.
 """
 
+import contextlib
 import os
 import re
 import signal
@@ -34,6 +35,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = (sys.executable, "-m", "shadowgraph")
 SAID_LINES = 4  # of a failed run's last output: enough for its error sentence, even if wrapped
 RAY_RETRIES = 3  # of a task whose worker died; each retry continues from the run's checkpoint
+GIVES_WAY = 5  # more of niceness: a third of what another program gets of a processor that both want
 LEAVING_S = 30.0  # seconds for the cluster to end the run of a dead worker; more are needed while kernels compile
 
 
@@ -142,27 +144,33 @@ def start_task(task: Task, is_detached: bool = False) -> subprocess.Popen[bytes]
     """Start the run of a task in a process of its own, which writes what it says into `log_file`.
 
     Args:
-        is_detached: neither Ctrl-C nor the end of this process reaches it.
+        is_detached: neither Ctrl-C nor the end of this process reaches it, and it gives way to what somebody waits for.
     """
     words = ["run", task.capture, "--out", str(Path(task.out) / task.name), "--viewer", "off", *task.options]
-    return start_command([*task.program, *words], log_file(task), task.threads, is_detached)
+    return start_command([*task.program, *words], log_file(task), task.threads, is_detached, gives_way=is_detached)
 
 
 def start_command(
-    words: Sequence[str], log: Path, threads: int | None = None, is_detached: bool = False, speaks: bool = False
+    words: Sequence[str],
+    log: Path,
+    threads: int | None = None,
+    is_detached: bool = False,
+    speaks: bool = False,
+    gives_way: bool = False,
 ) -> subprocess.Popen[bytes]:
     """Start one of our commands; what it says goes into `log`.
 
     Args:
         threads: that its kernels may use; all cores unless given.
         speaks: its stdin and stdout are pipes, and only its stderr goes into the log.
+        gives_way: to other programs, where the system has priorities: somebody waits for those meanwhile.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
     count = {} if threads is None else {"NUMBA_NUM_THREADS": str(threads), "OMP_NUM_THREADS": str(threads)}
     environment = os.environ | count | {"PYTHONPATH": paths}
     with log.open("wb") as file:
-        return subprocess.Popen(
+        process = subprocess.Popen(
             list(words),
             stdin=subprocess.PIPE if speaks else subprocess.DEVNULL,
             stdout=subprocess.PIPE if speaks else file,
@@ -170,6 +178,10 @@ def start_command(
             env=environment,
             start_new_session=is_detached,
         )
+    if gives_way and hasattr(os, "setpriority"):
+        with contextlib.suppress(OSError):  # it has ended already
+            os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + GIVES_WAY)
+    return process
 
 
 def log_file(task: Task) -> Path:

@@ -243,10 +243,19 @@ def draw_light(server: viser.ViserServer, index: int, light: Light, scale: PageS
 
 
 def draw_mesh(
-    server: viser.ViserServer, mesh: "trimesh.Trimesh", scale: PageScale, visible: bool = True, is_lit: bool = True
+    server: viser.ViserServer,
+    mesh: "trimesh.Trimesh",
+    scale: PageScale,
+    visible: bool = True,
+    is_lit: bool = True,
+    glb: bytes | None = None,
 ) -> viser.GlbHandle:
-    """Draw the final surface in its vertex colours, lit by the scene or exactly in these colours."""
-    glb = mesh_glb(mesh, is_lit)
+    """Draw the final surface in its vertex colours, lit by the scene or exactly in these colours.
+
+    Args:
+        glb: what `mesh_glb` makes of it, where that is known.
+    """
+    glb = mesh_glb(mesh, is_lit) if glb is None else glb
     return server.scene.add_glb("/mesh", glb, scale=scale.factor, visible=visible, cast_shadow=is_lit)
 
 

@@ -39,13 +39,14 @@ PACKING = (
 )
 TOKEN_BYTES = 24
 VISER_TITLE = b"<title>Viser</title>"
-# viser draws a white page until it hears of its theme: until then, for at most three seconds, there is a dark ground
-DARK = """<style>html,body{background:#141517}html:not(.themed) #root{visibility:hidden}</style><script>
+# viser draws a white page until it hears of its theme: until then, for at most eight seconds, there is a dark ground
+DARK = """<style>html,body{background:#141517}html:not(.themed) body{background:#141517!important}
+html:not(.themed) #root{visibility:hidden}</style><script>
 {const page = document.documentElement;
 const observer = new MutationObserver(() => { if (page.dataset.mantineColorScheme === "dark") show(); });
 const show = () => { observer.disconnect(); page.classList.add("themed"); };
 observer.observe(page, {attributeFilter: ["data-mantine-color-scheme"]});
-setTimeout(show, 3000);}
+setTimeout(show, 8000);}
 </script>"""
 COOKIE = "shadowgraph"
 FRAMES_WAITING = 4  # of one connection: received messages that are held before they are read

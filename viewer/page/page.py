@@ -6,8 +6,9 @@ are imported once the run is over. viewer/display/rate_limit.py limits how often
 """
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import viser
@@ -32,6 +33,7 @@ from viewer.display.layers import (
     first_view,
     framed_view,
     light_room,
+    mesh_glb,
     page_scale,
 )
 from viewer.display.rate_limit import RateLimit
@@ -54,16 +56,63 @@ if TYPE_CHECKING:
 
     from reconstruct.evaluate.deviation import ReferenceMesh
 
+T = TypeVar("T")
 WIDE = 1.6  # aspect of a window that is not known yet
+MOST_READ = 6  # files of a run that are kept for the next visitor
 REREAD_EVERY = 10  # polls, after which a folder without changes is read, because a killed run makes none
+
+
+class KeptReadings:
+    """What was read of a run's files, for several pages of it while the files are the same. Nobody changes it."""
+
+    def __init__(self) -> None:
+        """Start with nothing."""
+        self._kept: dict[tuple[Path, str], tuple[tuple[int, int], Any]] = {}
+        self._lock = threading.Lock()
+
+    def mesh(self, path: Path) -> "trimesh.Trimesh":
+        """Return a finished mesh."""
+        return self.get(path, lambda: read_mesh(path))
+
+    def glb(self, path: Path) -> bytes:
+        """Return a finished mesh as the browser takes it, lit."""
+        mesh = self.mesh(path)
+        return self.get(path, lambda: mesh_glb(mesh, True), "glb")
+
+    def get(self, path: Path, read: Callable[[], T], kind: str = "") -> T:
+        """Return what `read` makes of a file, made anew when the file has changed; `kind`: one of several readings."""
+        try:
+            stat = path.stat()
+        except OSError:
+            return read()
+        mark = (stat.st_mtime_ns, stat.st_size)
+        with self._lock:
+            known = self._kept.pop((path, kind), None)
+            if known is None or known[0] != mark:
+                known = (mark, read())
+            self._kept[path, kind] = known
+            while len(self._kept) > MOST_READ:
+                self._kept.pop(next(iter(self._kept)))
+            return known[1]
 
 
 class Page:
     """Shows one run folder in one viser server. One thread calls `refresh`; the controls call from others."""
 
-    def __init__(self, run_dir: Path, server: viser.ViserServer, reference: "ReferenceMesh | None" = None):
-        """Lay the page out; `refresh` reads the folder."""
+    def __init__(
+        self,
+        run_dir: Path,
+        server: viser.ViserServer,
+        reference: "ReferenceMesh | None" = None,
+        kept: KeptReadings | None = None,
+    ):
+        """Lay the page out; `refresh` reads the folder.
+
+        Args:
+            kept: readings that are shared with other pages of this run.
+        """
         self.follower = RunFollower(run_dir)
+        self._kept = kept or KeptReadings()
         self.server = server
         self.is_over = False
         self.controls = Controls(server, run_dir.resolve().name, self._show_layers)
@@ -159,11 +208,11 @@ class Page:
         from viewer.display.result import Result
 
         run, mesh, detail = StoredRun(self.follower.path), self._final_mesh, None
-        fields, calibration = run.fields, run.calibration
+        fields, calibration = self._kept.get(run.run_dir / FIELDS, lambda: run.fields), run.calibration
         try:
             if mesh is not None:
                 refuse_far_mesh(mesh, fields, run.run_dir)
-            detail = run.detail
+            detail = self._kept.get(run.run_dir / DETAIL, lambda: run.detail)
         except UserError as error:  # the rest of the result is there
             self.problem = str(error)
         self.tabs.show(Result(run.run_dir, calibration, fields, self._scale, mesh, detail))
@@ -224,9 +273,9 @@ class Page:
             return
         if self._calibration is None:
             return
-        mesh = read_mesh(path)
+        mesh = self._kept.mesh(path)
         self._mesh_name, self._final_mesh = name, mesh
-        self._mesh = draw_mesh(self.server, mesh, self._scale, is_visible)
+        self._mesh = draw_mesh(self.server, mesh, self._scale, is_visible, glb=self._kept.glb(path))
         self._frame(np.asarray(mesh.bounds))
         self._size = f"{size_text(mesh.extents, self._calibration.unit)} · {len(mesh.faces):,} faces"
 

@@ -11,7 +11,7 @@ from capture.errors import UserError
 from reconstruct.run.bundle import user_name
 from reconstruct.run_folder.cost import give_memory_back, share_memory_among_threads
 from viewer.page.guard import GuardedServer, is_loopback
-from viewer.page.page import Page
+from viewer.page.visitors import Visitors
 from viewer.stage.files import StageFiles
 
 POLL_S = 0.5  # between two looks at the folder: the growing mesh is written every two seconds
@@ -50,26 +50,27 @@ def view(
     share_memory_among_threads()
     stage = StageFiles(Path(run_dir), "socket", home="/")
     server = GuardedServer(host, port, stage, f"{Path(run_dir).resolve().name} - Shadowgraph")
-    page = Page(Path(run_dir), server, compared_with)
+    visitors = Visitors(Path(run_dir), server, compared_with)
     gc.freeze()  # objects made by imports stay; without this each collection would scan them for 0.15 s
     start = "stage/" if stage.is_ready else ""
     for line in address_lines(host, server.get_port(), server.token, start):
         say(line)
-    threading.Thread(target=stage.warm, daemon=True).start()
+    for warm in (stage.warm, visitors.warm):
+        threading.Thread(target=warm, daemon=True).start()
     if opens is not None:
         opens(f"http://localhost:{server.get_port()}/{start}" + (f"?token={server.token}" if server.token else ""))
     given_back = time.monotonic()
     try:
-        while not (once and page.is_over):
-            page.poll(is_watched=bool(server.get_clients()))
+        while not (once and visitors.is_over):
+            visitors.poll()
             if time.monotonic() - given_back > GIVE_BACK_S:
                 give_memory_back()  # of data for visitors who have left
                 given_back = time.monotonic()
-            time.sleep(POLL_S)
+            visitors.wait(POLL_S)
     except KeyboardInterrupt:
         say("Page closed.")
     finally:
-        page.close()
+        visitors.close()
         server.stop()
         gc.unfreeze()
 

@@ -27,8 +27,12 @@ class Tab(NamedTuple):
 
     def make(self, context: PanelContext, tab: viser.GuiTabHandle) -> Any:
         """Import the panel's class and make the panel."""
+        return self.load()(context, tab)
+
+    def load(self) -> Any:
+        """Import the panel's class and return it."""
         module, name = self.panel.split(":")
-        return getattr(importlib.import_module(module), name)(context, tab)
+        return getattr(importlib.import_module(module), name)
 
 
 TABS = (  # in their order on the page; to add one, see viewer/widgets/panel.py

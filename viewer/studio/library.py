@@ -17,6 +17,7 @@ from viewer.display.run_follower import RunFollower
 from viewer.studio.checking import Checks
 from viewer.studio.folder import NOTES, Notes, StudioFolder
 from viewer.studio.growing import mark_of
+from viewer.studio.page_words import in_page_words
 from viewer.studio.progress import run_progress
 
 PRESETS = ("draft", "standard", "fine", "paper")
@@ -98,17 +99,17 @@ class Library:
             "key": key,
             "title": titles.get(key, path.name),
             "state": state,
-            "sentence": sentence,
+            "sentence": in_page_words(sentence),
             "job": job.id if job else "",
             "progress": asdict(now),
             "preset": preset,
             "verdict": check.get("verdict", ""),
-            "verdict_sentence": check.get("sentence", ""),
+            "verdict_sentence": in_page_words(check.get("sentence", "")),
             "size": mesh.get("size") if state == FINISHED else None,
             "unit": report.get("unit", "mm"),
             "guessed": ((mesh.get("evidence") or {}).get("unconstrained") or {}).get("share"),
             "growing": mark_of(path) if state == RUNNING else "",
-            "warnings": report.get("warnings", [])[:20],
+            "warnings": [in_page_words(text) for text in report.get("warnings", [])[:20]],
             "date": changed,
             "has_report": is_regular(path / "report.html"),
             "has_mesh": is_regular(path / "mesh.ply"),
@@ -132,6 +133,7 @@ class Library:
             "state": state,
             "count": len(photos) + len(clips_of(path)),
             "coming": len(under_way),
+            "stalled": len(self._parts.stalled(key)),
             "coming_bytes": sum(part.size for part in under_way),
             "here_bytes": sum(self._parts.offset(part) for part in under_way),
             "verdict": check["verdict"],

@@ -7,12 +7,13 @@ import time
 from pathlib import Path
 
 from capture.errors import CaptureError
-from reconstruct.run.batch import PROGRAM, start_command
+from reconstruct.run.batch import PROGRAM, start_command, why_it_failed
 from viewer.studio.folder import StudioFolder
 from viewer.studio.sockets import free_socket
 
 HOST, FIRST_PORT = "127.0.0.1", 8080
 MOST_PAGES = 3  # at a time: each takes some hundred megabytes
+LOG = "view.txt"
 PATIENCE_S = 60.0  # until a page answers
 
 
@@ -41,7 +42,7 @@ class LivePages:
             with free_socket(HOST, FIRST_PORT) as taken:
                 port = taken.getsockname()[1]
             words = [*PROGRAM, "view", str(run), "--port", str(port), "--no-open"]
-            process = start_command(words, self._folder.kept / "view.txt")
+            process = start_command(words, self._folder.kept / LOG)
             address = f"http://localhost:{port}"
             self._open[run] = process, address
         end = time.monotonic() + PATIENCE_S
@@ -49,7 +50,7 @@ class LivePages:
             if answers(port):
                 return address
             time.sleep(0.1)
-        raise CaptureError("The 3D page did not open; `shadowgraph view` in a terminal says why.")
+        raise CaptureError(f"The 3D page did not open: {why_it_failed(process.poll(), self._folder.kept / LOG)}")
 
     def close(self) -> None:
         """End all pages."""

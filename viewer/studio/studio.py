@@ -237,6 +237,11 @@ class Studio:
         self.saving.clear()
         return self.trash.empty()
 
+    def go_on_without(self, key: str) -> None:
+        """Forget the files of a capture that stopped in the middle; who comes back sends them from the beginning."""
+        for part in self.parts.stalled(self.folder.key(self.folder.capture(key))):
+            self.parts.drop(part)
+
     def delete_photo(self, key: str, photo: str) -> None:
         """Move one photo or clip of a capture into the trash."""
         capture = self.folder.capture(key)

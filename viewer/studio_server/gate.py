@@ -16,6 +16,7 @@ from websockets.datastructures import Headers
 from capture.errors import UserError
 from capture.files.atomic import parse_json
 from viewer.page.guard import COOKIE, is_own_page, is_same
+from viewer.studio.page_words import in_page_words
 
 SAFE = ("GET", "HEAD")
 LARGEST_BODY = 1 << 20  # bytes of a request that is no piece of a file
@@ -137,7 +138,7 @@ def text_of(values: dict[str, Any], name: str, most: int = 1000) -> str:
 
 def as_sentence(_request: Request, error: Exception) -> Response:
     """Return the answer for what the user can mend: one sentence."""
-    status, text = 400, str(error)
+    status, text = 400, in_page_words(str(error))
     if isinstance(error, OSError):
         is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         status = 507 if is_full else 500

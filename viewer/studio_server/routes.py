@@ -18,6 +18,7 @@ from capture.files.regular import is_regular, read_regular
 from viewer.stage.files import HEADERS
 from viewer.stage.page import page_policy
 from viewer.studio import boards
+from viewer.studio.page_words import document_in_page_words
 from viewer.studio.studio import Studio
 from viewer.studio_server.gate import FRAMED_POLICY, as_sentence, read_body, read_object, text_of
 from viewer.studio_server.phones import Phones
@@ -28,6 +29,8 @@ OWNER_FILES = ("studio.css", "dom.js", "home.js", "capture.js", "result.js", "bo
 OWNER_FILES += ("hemisphere.js", "icon.svg", "phones.js", "save.js", "voice.js", "queue.js")
 SAVED = ("format", "size")  # what a request for another kind of file names beside the run
 LARGEST_PICTURE = 1 << 22  # bytes of a run under way: ours have 100 kB
+LARGEST_DOCUMENT = 1 << 26  # bytes of the page of a verdict: ours have some megabytes
+FRAMED = {"Content-Security-Policy": FRAMED_POLICY, "X-Frame-Options": "SAMEORIGIN"}
 KEPT = {"Cache-Control": "private, max-age=86400"}
 
 
@@ -71,7 +74,7 @@ def _questions(studio: Studio, phones: Phones) -> list[Route]:
         ask("/download", lambda r: _download(studio.saving.file(_key(r), *(r.query_params.get(n, "") for n in SAVED)))),
         ask("/stage/{path:path}", lambda r: _stage(studio, r)),
         ask("/report", lambda r: _framed(studio.folder.run(_key(r)) / "report.html")),
-        ask("/check_page", lambda r: _framed(studio.checks.page(studio.folder.capture(_key(r))))),
+        ask("/check_page", lambda r: _check_page(studio.checks.page(studio.folder.capture(_key(r))))),
     ]
 
 
@@ -94,6 +97,7 @@ def _changes(studio: Studio, phones: Phones) -> list[Route]:
         change("add", studio.folder.add, "key"),
         change("rename", studio.rename, "key", "title"),
         change("delete", studio.delete, "key"),
+        change("go_on_without", studio.go_on_without, "key"),
         change("delete_photo", studio.delete_photo, "key", "photo"),
         change("restore", studio.trash.restore, "id"),
         change("empty_trash", studio.empty_trash),
@@ -178,12 +182,16 @@ def _download(file: Path) -> Response:
     return FileResponse(file, media_type="application/octet-stream", filename=file.name)
 
 
-def _framed(found: "Path | Future[Any]") -> Response:
+def _framed(found: Path) -> Response:
     """Return a page made of content that may be a stranger's: without an origin, and nothing to load."""
-    if isinstance(found, Future):
-        found.result()
-        return JSONResponse({"wait": True}, 202)
     if not is_regular(found):
         raise CaptureError(f"There is no {found.name} yet.")
-    headers = {"Content-Security-Policy": FRAMED_POLICY, "X-Frame-Options": "SAMEORIGIN"}
-    return FileResponse(found, media_type="text/html", headers=headers)
+    return FileResponse(found, media_type="text/html", headers=FRAMED)
+
+
+def _check_page(found: Path) -> Response:
+    """Return the page of a verdict as `_framed` does, in the words of this page."""
+    if not is_regular(found):
+        raise CaptureError(f"There is no {found.name} yet.")
+    document = read_regular(found, LARGEST_DOCUMENT).decode("utf-8", "replace")
+    return Response(document_in_page_words(document), media_type="text/html", headers=FRAMED)

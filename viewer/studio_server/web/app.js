@@ -12,6 +12,7 @@ let view = null, timer = 0, turn = 0, isLost = false;
 function route() {
   const [name, ...rest] = location.hash.replace(/^#\/?/, "").split("/");
   const make = VIEWS[name] || home;
+  document.querySelectorAll("dialog").forEach((box) => box.dispatchEvent(new Event("cancel"))); // Back asks for another page
   if (view && view.close) view.close();
   view = make(decodeURIComponent(rest.join("/")), again);
   main.className = view.wide ? "wide" : "";

@@ -1,6 +1,6 @@
 // One capture: its board, its photos as they arrive, the verdict, and the start of a run.
 
-import { PRESETS, about, ask as question, attempt, bytes, change, day, dialog, duration, h, key, picture, plural, size, toast } from "./dom.js";
+import { PRESETS, about, ask as question, attempt, bytes, change, day, dialog, duration, failure, h, key, picture, plural, size, toast } from "./dom.js";
 import { boardOnScreen, printLink } from "./board.js";
 import { dome } from "./hemisphere.js";
 import { phones } from "./phones.js";
@@ -29,6 +29,7 @@ export function capture(name, again) {
       if (found.length) [times, timed] = [found, row.photos.length];
     }
     await phone.refresh();
+    view.pause = row.photos.some((photo) => !photo.looked) ? 400 : 1000; // what is wrong with a new photo is said soon
     document.title = `${row.title} · Shadowgraph studio`;
     return [
       h("div", { class: "bar" }, h("h1", { class: "grow" }, row.title), h("button", { onclick: () => rename(row) }, "Rename"),
@@ -50,13 +51,20 @@ export function capture(name, again) {
       } },
         h("p", {}, "Drop photos, a folder, a .zip or a clip here: the board in room light, and the object under the flashlight."),
         h("div", { class: "bar" }, chooser("Choose files", {}), chooser("Choose a folder", { webkitdirectory: true }), phone.button())),
-      phone.panel(), sending(sender),
+      phone.panel(), sending(sender), row.stalled > 0 && stalled(row),
       row.refused.length > 0 && h("div", { class: "bad small" }, h("p", {}, "Not taken:"),
         h("ul", { class: "plain" }, row.refused.slice(-5).map((one) => h("li", {}, `${one.name.split("/").pop()}: ${one.why}`)))),
       row.photos.length + row.clips.length > 0 && h("p", { class: "quiet" }, counts(row)),
       bad.length > 0 && h("p", { class: "warn" }, `Take again: ${bad.slice(0, 4).map((photo) => `${photo.name} (${photo.remarks[0][0]})`).join(", ")}`),
       row.clips.map((clip) => h("p", { key: clip }, `Clip: ${clip}`)),
       h("ul", { class: "photos" }, row.photos.map((photo) => thumb(row, photo))));
+  }
+
+  /** Files whose sender has left in the middle: they keep a run from starting. */
+  function stalled(row) {
+    return h("div", { class: "warn", key: "stalled" },
+      h("p", {}, `${plural(row.stalled, "file")} stopped in the middle: the phone or page that sends ${row.stalled === 1 ? "it" : "them"} has left, or lost the network. Sending goes on by itself when it is back.`),
+      h("button", { onclick: () => attempt(async () => { await change("go_on_without", { key: row.key }); again(); }) }, "Go on without"));
   }
 
   function chooser(words, more) {
@@ -122,7 +130,7 @@ export function capture(name, again) {
       row.photos.length + row.clips.length === 0 && h("p", { class: "quiet" }, "Photos first: 15 to 40 of the object, each with the light elsewhere."),
       isPending && h("p", { class: "quiet" }, check.is_running ? "Looking at all photos together." : "Waits for the photos to pause."),
       check.sentence && h("p", { class: `verdict ${check.verdict}` }, check.sentence),
-      !check.sentence && check.error && failed(check.error),
+      !check.sentence && check.error && failure(check.error),
       check.advice.length > 0 && h("div", {}, h("h3", {}, "Shoot next"), h("ul", { class: "plain" }, check.advice.map((text) => h("li", {}, text)))),
       check.reasons.length > 1 && h("details", {}, h("summary", {}, "Why"), h("ul", { class: "plain" }, check.reasons.map((text) => h("li", {}, text)))),
       row.coach.advice && (check.is_old || !check.sentence) && h("p", { class: "verdict" }, row.coach.advice),
@@ -134,13 +142,6 @@ export function capture(name, again) {
         again();
       }) }, "Check now"),
         check.sentence && h("a", { class: "button", href: `/check_page?key=${key(row.key)}`, target: "_blank", rel: "noopener" }, "All details")));
-  }
-
-  /** Why nobody can judge the photos: what is wrong and what to do; the rest of a long text below, smaller. */
-  function failed(text) {
-    const [first, second, ...rest] = text.split(/(?<=[.:]) (?=[A-Z])/);
-    return h("div", {}, h("p", { class: "verdict bad" }, first[0].toUpperCase() + first.slice(1)), second && h("p", {}, second),
-      rest.length > 0 && h("p", { class: "small quiet" }, rest.join(" ")));
   }
 
   function startPanel(row) {

@@ -81,7 +81,8 @@ export function home(_, again) {
 
   function words(card, run, state) {
     if (state === "arriving" && card.coming) {
-      return h("p", { class: "small" }, `${plural(card.coming, "file")} on the way, ${bytes(card.here_bytes)} of ${bytes(card.coming_bytes)} here`);
+      return h("p", { class: "small" }, `${plural(card.coming, "file")} on the way, ${bytes(card.here_bytes)} of ${bytes(card.coming_bytes)} here`,
+        card.stalled > 0 && h("span", { class: "warn" }, "; stopped in the middle: the sender has left"));
     }
     if (state === "running") {
       const left = run.progress.left_s;
@@ -117,9 +118,10 @@ export function home(_, again) {
   function trash(deleted) {
     if (!deleted.length) return null;
     const total = deleted.reduce((sum, one) => sum + one.bytes, 0);
-    return h("details", { class: "panel", key: "trash" }, h("summary", {}, `Trash: ${plural(deleted.length, "thing")}, ${bytes(total)}`),
-      h("ul", { class: "plain" }, deleted.map((one) => h("li", { key: one.id }, `${one.title} (${bytes(one.bytes)}, ${day(one.when)}) `,
-        h("button", { onclick: () => attempt(async () => { await change("restore", { id: one.id }); again(); }) }, "Put back")))),
+    return h("details", { class: "panel trash", key: "trash" }, h("summary", {}, `Trash: ${plural(deleted.length, "thing")}, ${bytes(total)}`),
+      h("ul", { class: "plain" }, deleted.map((one) => h("li", { key: one.id },
+        h("span", { class: "grow" }, one.title, " ", h("span", { class: "quiet small" }, `${bytes(one.bytes)}, ${day(one.when)}`)),
+        h("button", { "aria-label": `Put back: ${one.title}`, onclick: () => attempt(async () => { await change("restore", { id: one.id }); again(); }) }, "Put back")))),
       h("button", { class: "danger", onclick: () => attempt(async () => {
         if (await dialog("Empty the trash?", `${bytes(total)} are deleted for good.`, "Delete for good", { isDanger: true })) {
           toast(`${bytes(await change("empty_trash"))} freed.`);

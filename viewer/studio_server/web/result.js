@@ -1,6 +1,6 @@
 // A run: its progress while it runs, its result once it is finished; two results side by side.
 
-import { about, attempt, change, dialog, duration, h, key, plural, presetWords, size } from "./dom.js";
+import { about, attempt, change, dialog, duration, failure, h, key, plural, presetWords, size } from "./dom.js";
 import { saving } from "./save.js";
 
 export function run(name, again) {
@@ -23,7 +23,7 @@ export function run(name, again) {
         h("button", { onclick: () => rename(one) }, "Rename"),
         h("button", { class: "danger", disabled: one.state === "running" || one.state === "waiting", onclick: () => remove(one) }, "Delete"),
         h("a", { class: "button", href: "#/" }, "All captures")),
-      one.state === "finished" ? result(one) : progress(one, before(state.queue, one)),
+      one.state === "finished" ? result(one) : progress(one, before(state.queue, one), card.kind === "capture" ? `#/capture/${key(card.key)}` : ""),
     ];
   };
 
@@ -33,7 +33,7 @@ export function run(name, again) {
     return lefts.length && lefts.every((left) => left !== null && left !== undefined) ? ` It begins in ${about(lefts.reduce((sum, left) => sum + left, 0))}.` : "";
   }
 
-  function progress(one, begins) {
+  function progress(one, begins, photos) {
     const now = one.progress, percent = Math.round(100 * now.share);
     return h("section", { class: "panel" },
       h("h2", {}, one.state === "running" ? now.title : one.state === "waiting" ? "In the queue" : one.state === "failed" ? "It failed" : "Stopped"),
@@ -43,13 +43,14 @@ export function run(name, again) {
         now.left_s ? `, about ${duration(now.left_s)} left` : ""),
       now.message && one.state === "running" && h("p", { class: "quiet" }, now.message),
       one.state === "running" && watched(one),
-      one.sentence && h("p", { class: one.state === "failed" ? "bad" : "" }, one.sentence, one.state === "waiting" && begins),
+      one.sentence && (one.state === "failed" ? failure(one.sentence) : h("p", {}, one.sentence, one.state === "waiting" && begins)),
       one.state === "running" && h("p", { class: "quiet" }, "It goes on when this page or the studio is closed."),
       h("div", { class: "bar" },
         (one.state === "running" || one.state === "waiting") && one.job && h("button", { onclick: () => queue(one, "stop") }, one.state === "running" ? "Stop and keep" : "Take out of the queue"),
         one.state === "running" && h("button", { onclick: () => inspect(one) }, "Watch it grow in 3D"),
         one.state === "waiting" && h("button", { onclick: () => queue(one, "first") }, "Next in line"),
-        (one.state === "failed" || one.state === "stopped") && one.job && h("button", { class: "main", onclick: () => queue(one, "again") }, "Go on where it stood")));
+        (one.state === "failed" || one.state === "stopped") && one.job && h("button", { class: "main", onclick: () => queue(one, "again") }, "Go on where it stood"),
+        one.state === "failed" && photos && h("a", { class: "button", href: photos }, "Look at its photos")));
   }
 
   function result(one) {
@@ -61,7 +62,8 @@ export function run(name, again) {
       one.verdict_sentence && h("p", {}, one.verdict_sentence),
       one.warnings.length > 0 && h("details", { class: "panel" }, h("summary", { class: "warn" }, plural(one.warnings.length, "remark")),
         h("ul", { class: "plain" }, one.warnings.map((text) => h("li", {}, text)))),
-      h("div", { class: "bar" }, one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report"),
+      h("div", { class: "bar" }, one.has_mesh && h("a", { class: "button", href: stageOf(one), target: "_blank", rel: "noopener" }, "Fill the window"),
+        one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report"),
         h("button", { onclick: () => inspect(one) }, "Inspect in 3D")),
       one.has_mesh && saver.panel());
   }
@@ -123,9 +125,11 @@ function watch(name) {
   };
 }
 
+const stageOf = (one) => `/stage/${one.key.split("/").map(key).join("/")}/`;
+
 /** The stage of a run; one that the run has not packed is packed at the first look. */
 function frame(one) {
-  const address = `/stage/${one.key.split("/").map(key).join("/")}/`;
+  const address = stageOf(one);
   const element = h("iframe", { class: "result", title: `${one.title}, to relight and turn`, key: `${address} ${one.date}`,
     sandbox: "allow-scripts allow-same-origin allow-downloads" });
   element.stays = true;

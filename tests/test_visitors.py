@@ -1,0 +1,62 @@
+"""Two windows that look at one run: what one does with light and layers is not seen in the other."""
+
+import gc
+import weakref
+from pathlib import Path
+
+import fake_run
+import pytest
+from chromium import open_page
+from waiting import wait_until
+
+from viewer.page.guard import GuardedServer
+from viewer.page.page import KeptReadings
+from viewer.page.visitors import Visitors
+
+pytestmark = pytest.mark.browser
+
+
+def test_what_one_visitor_switches_the_other_does_not_see_and_who_leaves_is_forgotten(browser, truth, tmp_path):
+    run = tmp_path / "heap"
+    fake_run.start_run(run, truth)
+    fake_run.finish_run(run, truth)
+    server = GuardedServer("127.0.0.1", 0)
+    visitors = Visitors(run, server)
+
+    def polled(is_true) -> None:
+        wait_until(lambda: visitors.poll() or is_true())
+
+    try:
+        address = f"http://localhost:{server.get_port()}"
+        tabs = []
+        for number in range(2):
+            tabs.append(open_page(browser, address, is_drawn=False)[0])
+            polled(lambda number=number: len(visitors.pages) == number + 1)
+        pages = list(visitors.pages.values())
+        polled(lambda: all(page.tabs.result_panels for page in pages))
+        tabs[0].get_by_text("Show", exact=True).click()
+        tabs[0].get_by_label("Surface").uncheck()
+        polled(lambda: not pages[0].controls.shows("Surface"))
+        assert pages[1].controls.shows("Surface")
+        assert pages[0]._final_mesh is pages[1]._final_mesh  # read once
+        gone = weakref.ref(pages.pop(0))
+        tabs[0].close()
+        polled(lambda: list(visitors.pages.values()) == pages)
+        polled(lambda: gc.collect() and gone() is None)  # nothing keeps what was shown to one who has left
+        assert visitors.is_over
+        tabs[1].close()
+        polled(lambda: not visitors.pages)
+    finally:
+        visitors.close()
+        server.stop()
+
+
+def test_a_file_is_read_once_until_it_changes(tmp_path: Path):
+    file, kept, reads = tmp_path / "mesh.ply", KeptReadings(), []
+    file.write_text("one")
+    for _ in range(2):
+        assert kept.get(file, lambda: reads.append(1) or file.read_text()) == "one"
+    file.write_text("another")
+    assert kept.get(file, file.read_text) == "another"
+    assert kept.get(file, lambda: 7, "count") == 7
+    assert len(reads) == 1
