@@ -12,7 +12,15 @@ from reconstruct.labels.outline import dilated, local_mean
 from reconstruct.scene import Scene, grey_irradiance, grey_of
 from reconstruct.shading.joint_normals import Picture, fit_together
 from reconstruct.shading.noise import DEFAULT_NOISE, Noise
-from reconstruct.shading.normal_fit import INDIRECT_SHARE, MODEL_SHARE, Pixels, Prior, fit_normals, indirect_light, misfit
+from reconstruct.shading.normal_fit import (
+    INDIRECT_SHARE,
+    MODEL_SHARE,
+    Pixels,
+    Prior,
+    fit_normals,
+    indirect_light,
+    misfit,
+)
 
 CHUNK = 8192  # pixels at once: 40 photos of them stay near the processor
 DARKER_DOUBT = 1.0  # log ratio to the neighbours' albedo at which a darker fit is no longer trusted
@@ -106,9 +114,9 @@ def _explained(errors: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
     """Return the share of trust that pixels keep whose photos no normal and albedo explain, by their misfit.
 
     An underside in sight of lit ground looks like a dark plate that faces up and is lit in all photos; its lit rays
-    would carve the object. Of the samples called lit in three rendered captures, 1 in 5,000 is not with a misfit below
-    .25, 1 in 20 to 60 with 1 to 1.5, a third with 3 to 5 and two thirds beyond; normals are 2, 5 to 9, 35 to 75 and
-    100 degrees off.
+    would carve the object. Of the samples called lit in two rendered captures, less than 1 in 5,000 is not with a
+    misfit below .25, 2 to 5 in 100 with 1 to 1.5, a fifth to a half with 3 to 5, and a third to two thirds beyond;
+    normals are 2, 5 to 9, 36 to 77 and 56 to 110 degrees off (docs/method.md).
     """
     scale = (errors.median() / USUAL_MISFIT).clamp(min=1.0)
     return ((UNEXPLAINED - errors / scale) / (UNEXPLAINED - EXPLAINED)).clamp(0, 1)
