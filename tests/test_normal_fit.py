@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from reconstruct.shading.noise import Noise
-from reconstruct.shading.normal_fit import Pixels, Prior, fit_normals
+from reconstruct.shading.normal_fit import Pixels, Prior, fit_normals, misfit
 
 ALBEDO = 0.4
 LIGHTS = torch.nn.functional.normalize(
@@ -72,6 +72,16 @@ def test_many_lit_photos_overrule_albedo_and_surface(normals):
     facing = (up @ LIGHTS.T > 0.1).all(1)
     assert facing.sum() > 50
     assert error(solved, up)[facing].median() < 1.5
+
+
+def test_shadows_are_no_misfit_and_two_surfaces_in_one_pixel_are(normals):
+    up = torch.nn.functional.normalize(normals + 2 * LIGHTS.mean(0), dim=-1)
+    up = up[(up @ LIGHTS.T > 0.15).all(1)]
+    assert misfit(seen(up, range(5)), ALBEDO * up).max() < 0.01
+    assert misfit(seen(up, (0, 1, 4)), ALBEDO * up).max() < 0.01
+    mixed = seen(up, range(5))
+    mixed.value[:, [0, 1]] += torch.tensor([-0.12, 0.3])  # half dark, and lit by something else
+    assert misfit(mixed, ALBEDO * up).min() > 3
 
 
 def test_a_highlight_is_left_out(normals):

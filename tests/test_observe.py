@@ -137,6 +137,23 @@ def test_a_highlight_does_not_bend_the_normals():
     assert np.median(angle[trusted]) < 0.3
 
 
+def test_pixels_that_no_surface_explains_say_nothing():
+    scene, truth = render((BALL,), PLAIN)
+    rows, columns = (places[len(places) // 2 :][:200] for places in np.nonzero(truth.mask))
+    odd = scene.rgb.clone()  # as light from other parts of the object makes them: of any brightness in any photo
+    factor = np.random.default_rng(4).uniform(0.05, 1, (len(odd), len(rows), 1))
+    odd[:, rows, columns] = 0.5 * torch.from_numpy(factor).float().expand(-1, -1, 3)
+    plain, found = (
+        label_object(replace(scene, rgb=rgb), tensor(truth.points), None, tensor(truth.mask))
+        for rgb in (scene.rgb, odd)
+    )
+    assert plain.confidence[:, rows, columns].mean() > 0.3 and plain.normal_confidence[rows, columns].mean() > 0.3
+    assert found.confidence[:, rows, columns].mean() < 0.03 and found.normal_confidence[rows, columns].mean() < 0.01
+    others = truth.mask.copy()
+    others[rows, columns] = False
+    assert (found.confidence[:, others] - plain.confidence[:, others]).abs().mean() < 5e-3
+
+
 def test_labels_cover_ground_and_object_without_mixing_them():
     scene, truth = render((BALL,), PLAIN)
     found = ground_module.test_ground(scene)

@@ -106,17 +106,35 @@ def fit_normals(pixels: Pixels, prior: Prior | None = None) -> tuple[Float[Tenso
 
 def _improbability(pixels: Pixels, solved: Float[Tensor, "n 3"], prior: Prior) -> Float[Tensor, " n"]:
     """Return -2 log probability of albedo * normal: each sample is lit, in shadow or neither; plus the prior."""
-    length, normal, indirect, variance = _unlit(pixels, solved)
-    sigma = variance.sqrt()
-    direct = (_dot(pixels.towards, solved) * pixels.strength).clamp(min=0)
-    lit = bounded((pixels.value - indirect - direct) / sigma)
-    dark = bounded((pixels.value - indirect) / sigma) + CAST_SHADOW
-    cost = (torch.minimum(lit, dark) * pixels.usable).sum(1)
+    lit, dark, length, normal = _sample_costs(pixels, solved)
+    cost = (torch.minimum(lit, dark + CAST_SHADOW) * pixels.usable).sum(1)
     cost = cost + bounded(-((length[:, 0].clamp(min=1e-6) / prior.albedo.clamp(min=1e-6)).log() / ALBEDO_SIGMA).abs())
     if prior.normals is not None:
         known = (prior.normals != 0).any(-1)
         cost = cost + known * (2 - 2 * (normal * prior.normals).sum(-1)) / NORMAL_SIGMA**2
     return cost
+
+
+def misfit(pixels: Pixels, solved: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    """Return how badly albedo * normal explains a pixel: the mean squared error of its samples, in sigmas, bounded.
+
+    Each sample counts as lit or in shadow, whichever is more probable. What no surface under these lights can show, as
+    light from the object itself or two surfaces in one pixel, has a large one.
+    """
+    lit, dark, _, _ = _sample_costs(pixels, solved)
+    error = torch.where(lit < dark + CAST_SHADOW, lit, dark)
+    return (error * pixels.usable).sum(1) / pixels.usable.sum(1).clamp(min=1)
+
+
+def _sample_costs(
+    pixels: Pixels, solved: Float[Tensor, "n 3"]
+) -> tuple[Float[Tensor, "n photos"], Float[Tensor, "n photos"], Float[Tensor, "n 1"], Float[Tensor, "n 3"]]:
+    """Return the cost of each sample as lit and as one in shadow; and the albedo and the normal of the result."""
+    length, normal, indirect, variance = _unlit(pixels, solved)
+    sigma = variance.sqrt()
+    direct = (_dot(pixels.towards, solved) * pixels.strength).clamp(min=0)
+    lit = bounded((pixels.value - indirect - direct) / sigma)
+    return lit, bounded((pixels.value - indirect) / sigma), length, normal
 
 
 def bounded(residual: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
