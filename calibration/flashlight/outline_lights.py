@@ -2,8 +2,8 @@
 
 A phone that lifts shadows or bends contrast, and a hot beam, make the shading of each photo misleading. Outlines do not
 depend on brightness. They leave four numbers free that all lights share (the silhouette fixes three of these loosely);
-the shading of all photos together decides them (common_motion). Both are fitted together from rough starts, with shading
-trusted only as far as its own misfit allows. Photos whose shadows the picture cuts are located last.
+the shading of all photos together decides them (common_motion). Both are fitted together from rough starts, with
+shading trusted only as far as its own misfit allows. Photos whose shadows the picture cuts are located last.
 """
 
 from dataclasses import replace
