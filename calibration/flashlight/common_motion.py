@@ -31,6 +31,7 @@ FREE_AIMS = (0.3,) * len(BLURS)  # of the scale: how far beams may miss the comm
 NARROW_AIMS = (0.1, 0.12, 0.15, 0.2, 0.25, 0.3)  # ... and in a pass that begins with all beams aimed alike
 FOLLOWED = 2  # starts, the best of one pass, that are followed by further ones
 PASSES = 3  # of these, at most, ...
+LOST = 1e9  # the posterior of lights that no ground follows
 GAIN = 2.0  # ... while each gains more than this of the negative log posterior
 SMALL = (-0.1, 0.0, 0.1)  # homologies, of the median 1 / z
 MORE_SCANS = 4  # at most, where the best start is the first or the last of its scan
@@ -243,8 +244,9 @@ def _settled(start: Flashlights, evidence: Evidence, weighted: Evidence, priors:
     assert terms is not None
     flashlights, weight = refine(start, weighted, priors, free_tangent, FAR[:8] + NEAR)
     misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
+    posterior = _posterior(flashlights, terms, weighted.weight, misfit)
     return (
-        _posterior(flashlights, terms, weighted.weight, misfit),
+        posterior if (weight > 0).any() else LOST,
         FlashlightFit(flashlights, _weighted(evidence, misfit), weight, priors, free_tangent),
         misfit,
     )

@@ -19,7 +19,7 @@ from calibration.flashlight.common_motion import (
     at_best_contrast,
     searched,
 )
-from calibration.flashlight.fit import FAR, NEAR, FlashlightFit
+from calibration.flashlight.fit import FAR, MIN_GROUND, NEAR, FlashlightFit
 from calibration.flashlight.model import (
     PER_FLASHLIGHT,
     Evidence,
@@ -60,7 +60,7 @@ def with_outlines(
     by_shading: Float[np.ndarray, "photos 3"],
     cues: MetricCues = NO_CUES,
 ) -> FlashlightFit | None:
-    """Return the joint fit, world frame; None where no object or too few shadows are in sight.
+    """Return the joint fit, world frame; None without an object, enough shadows, or ground that follows.
 
     Args:
         evidence: of the used photos, before any fit.
@@ -87,11 +87,18 @@ def with_outlines(
     cells = replace(_lit_cells(evidence, shadows, posed_camera), outlines=terms)
     starts.append(by_shading)
     fit, number = searched(starts, cells)
+    if _ground(fit) < MIN_GROUND / THIN:
+        return None
     complete = _with_strays(fit, starts[number], by_shading, whole)
     # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share
     contrasts = (1.0,) if stack.is_linear else CONTRASTS
     found = at_best_contrast(complete.flashlights, replace(cells, outlines=complete.evidence.outlines), contrasts)
-    return replace(found, between=found.between + fit.between)
+    return replace(found, between=found.between + fit.between) if _ground(found) >= MIN_GROUND / THIN else None
+
+
+def _ground(fit: FlashlightFit) -> int:
+    """Return how many ground cells follow the lights."""
+    return int((fit.weight.sum(0) > 0).sum())
 
 
 def _is_stray(terms: OutlineTerms, places: Float[np.ndarray, "photos 3"]) -> Bool[np.ndarray, " photos"]:
