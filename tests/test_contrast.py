@@ -22,11 +22,11 @@ SHIFT = 0.3  # of a light's distance per unit of contrast
 class Silent(OutlineTerms):
     """Outlines that say nothing."""
 
-    def cost(self, positions, blur=1.0):
+    def cost(self, positions):
         """Agree with everything."""
         return 0.0
 
-    def rows(self, positions, blur=1.0):
+    def rows(self, positions):
         """Pull nowhere."""
         return np.zeros(0), np.zeros((0, len(positions), 3))
 

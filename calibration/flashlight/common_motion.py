@@ -1,4 +1,5 @@
-"""The motion of all lights together that outlines leave free, decided by the shading of all photos."""
+"""All lights from outlines and shading together: the search from rough starts, and the motion that outlines leave free,
+which the shading of all photos decides."""
 
 from dataclasses import replace
 
@@ -24,21 +25,88 @@ from capture.checks.robust import spread
 AIM_ROUNDS = 2  # of looking for aims, each with the beam that the last one's aims gave
 LEAST_SHARE = 0.2  # of a light's height that a motion leaves
 USUAL_MISFIT = 0.03  # log units, before it is measured
-HOMOLOGIES = (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)  # of the median 1 / z
-SMALL = (-0.1, 0.0, 0.1)  # likewise, once the lights are known
+BLURS = (8.0, 5.0, 3.0, 2.0, 1.4, 1.0)  # factors of an outline's sigma in one pass of the search, ...
+PER_BLUR = 4  # ... and the steps with each
+FREE_AIMS = (0.3,) * len(BLURS)  # of the scale: how far beams may miss the common aim, ...
+NARROW_AIMS = (0.1, 0.12, 0.15, 0.2, 0.25, 0.3)  # ... and in a pass that begins with all beams aimed alike
+FOLLOWED = 2  # starts, the best of one pass, that are followed by further ones
+PASSES = 3  # of these, at most, ...
+LOST = 1e9  # the posterior of lights that no ground follows
+GAIN = 2.0  # ... while each gains more than this of the negative log posterior
+SMALL = (-0.1, 0.0, 0.1)  # homologies, of the median 1 / z
 MORE_SCANS = 4  # at most, where the best start is the first or the last of its scan
 SCATTER = 4.0  # of the negative log posterior between joint fits from near starts: it has many small minima
 ALIKE = 40.0  # ground cells that are wrong together: a misfit is smooth over some 60 mm
 CONTRASTS = (0.7, 0.8, 0.9, 1.0, 1.1)  # of log brightness in the picture over that in the scene, that are tried
 CONTRAST_WIDTH = 0.1  # prior sigma of its logarithm about 0: phones lift whole regions that are dark
+_Found = tuple[float, FlashlightFit, float]  # negative log posterior, fit, misfit of its shading (log units)
 LOOSE = Priors(log_power=0.1, beam=50.0, power_outlier=0.5)  # a hot centre, rings; a phone's tone differs by photo
 
 
-def best_common_motion(
-    lights: Float[np.ndarray, "photos 3"],
+def searched(starts: list[Float[np.ndarray, "photos 3"]], evidence: Evidence) -> tuple[FlashlightFit, int]:
+    """Fit to outlines and shading together from rough starts; return the best fit, and the number of its start.
+
+    Outlines alone pull all lights too near, and one light that is too near, its beam aimed elsewhere, may agree with
+    its photo. So both are fitted from the first step on, with an outline's sigma that falls to its own (graduated
+    non-convexity) [Blake and Zisserman, Visual Reconstruction (1987)]; the best are followed by further passes, and by
+    one that begins with all beams aimed alike. What is best is decided by the cost of everything. `between` of the fit
+    holds what the others say that explain the photos about as well.
+
+    Args:
+        starts: positions, world.
+        evidence: with outlines; photos that these do not trust stay about where the starts put them.
+    """
+    assert evidence.outlines is not None
+    first = [_pass(one, evidence, USUAL_MISFIT, None, FREE_AIMS) for one in starts]
+    order = np.argsort([one[0] for one in first])[:FOLLOWED]
+    found = [_followed(first[number], evidence) for number in order]
+    posterior = np.array([one[0] for one in found])
+    best = int(posterior.argmin())
+    fit = found[best][1]
+    places = np.stack([one[1].flashlights.positions for one in found])
+    weight = np.exp((posterior.min() - posterior) / SCATTER)
+    between = variance_about(fit.flashlights.positions, places, weight) * evidence.outlines.trusted[:, None]
+    return replace(fit, between=between), int(order[best])
+
+
+def _followed(found: _Found, evidence: Evidence) -> _Found:
+    """Return the best of further passes of the search."""
+    for _ in range(PASSES):
+        further = _again(found, evidence, FREE_AIMS)
+        gain = found[0] - further[0]
+        found = further if gain > 0 else found
+        if gain < GAIN:
+            break
+    alike = _again(found, evidence, NARROW_AIMS)
+    return min((found, alike, _again(alike, evidence, FREE_AIMS)), key=lambda one: one[0])
+
+
+def _again(found: _Found, evidence: Evidence, aims: tuple[float, ...]) -> _Found:
+    _, fit, misfit = found
+    return _pass(fit.flashlights.positions, evidence, misfit, fit.flashlights, aims)
+
+
+def _pass(
+    places: Float[np.ndarray, "photos 3"],
     evidence: Evidence,
-    sizes: tuple[float, ...] = HOMOLOGIES,
-    like: Flashlights | None = None,
+    misfit: float,
+    like: Flashlights | None,
+    aims: tuple[float, ...],
+) -> _Found:
+    """Fit as _joint does, after steps with blurred outlines; aims: prior sigmas, one for each blur."""
+    assert evidence.outlines is not None
+    weighted = _trusted(evidence, misfit)
+    state = _held(places, weighted, like)[0]
+    if aims[0] < aims[-1]:
+        state = replace(state, targets=np.repeat(state.aim[None], len(places), 0))
+    for blur, aim in zip(BLURS, aims, strict=True):
+        blurred = replace(weighted, outlines=replace(evidence.outlines, blur=blur))
+        state = refine(state, blurred, replace(LOOSE, aim=aim), free_tangent, FAR[:PER_BLUR])[0]
+    return _settled(state, evidence, weighted, LOOSE)
+
+
+def best_common_motion(
+    lights: Float[np.ndarray, "photos 3"], evidence: Evidence, sizes: tuple[float, ...], like: Flashlights
 ) -> FlashlightFit:
     """Fit to outlines and shading together from several starts that cast the same shadows; return the mean of these.
 
@@ -51,11 +119,9 @@ def best_common_motion(
         lights: positions, world.
         evidence: with outlines.
         sizes: of the motions that are tried first; see same_shadows.
-        like: a state with aims, powers and beam to begin with; None: they are looked for, the lights held.
+        like: a state with aims, powers and beam to begin with.
     """
     assert evidence.outlines is not None
-    if like is None:
-        like = _held(lights, _trusted(evidence, USUAL_MISFIT), None)[0]
     posterior, fit, goes_on = _scan(lights, evidence, sizes, like)
     for _ in range(MORE_SCANS):
         if not goes_on:
@@ -106,15 +172,6 @@ def _as_pictured(fit: FlashlightFit, evidence: Evidence) -> FlashlightFit:
     flashlights, weight = _held(fit.flashlights.positions, trusted, fit.flashlights)
     misfit = spread(cell_residuals(flashlights, trusted, weight)[trusted.weight > 0])
     return replace(fit, flashlights=flashlights, weight=weight, evidence=_weighted(evidence, misfit))
-
-
-def contradiction(lights: Float[np.ndarray, "photos 3"], evidence: Evidence) -> float:
-    """Return the negative log posterior of lights that are held at these places (world), to compare starts by."""
-    assert evidence.outlines is not None
-    trusted = _trusted(evidence, USUAL_MISFIT)
-    flashlights, weight = _held(lights, trusted, None)
-    misfit = spread(cell_residuals(flashlights, trusted, weight)[trusted.weight > 0])
-    return _posterior(flashlights, evidence.outlines, trusted.weight, misfit)
 
 
 def _posterior(flashlights: Flashlights, terms: OutlineTerms, weight: Samples, misfit: float) -> float:
@@ -172,19 +229,24 @@ def same_shadows(
 
 def _joint(
     places: Float[np.ndarray, "photos 3"], evidence: Evidence, misfit: float, priors: Priors, like: Flashlights
-) -> tuple[float, FlashlightFit, float]:
+) -> _Found:
     """Fit all trusted photos from given places; return the negative log posterior, the fit and the shading's misfit.
 
     The fit's evidence has the shading of all photos.
     """
+    weighted = _trusted(evidence, misfit)
+    return _settled(_held(places, weighted, like)[0], evidence, weighted, priors)
+
+
+def _settled(start: Flashlights, evidence: Evidence, weighted: Evidence, priors: Priors) -> _Found:
+    """Refine a state; weighted: the evidence as its misfit allows. Returns what _joint does."""
     terms = evidence.outlines
     assert terms is not None
-    weighted = _trusted(evidence, misfit)
-    flashlights = _held(places, weighted, like)[0]
-    flashlights, weight = refine(flashlights, weighted, priors, free_tangent, FAR[:8] + NEAR)
+    flashlights, weight = refine(start, weighted, priors, free_tangent, FAR[:8] + NEAR)
     misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
+    posterior = _posterior(flashlights, terms, weighted.weight, misfit)
     return (
-        _posterior(flashlights, terms, weighted.weight, misfit),
+        posterior if (weight > 0).any() else LOST,
         FlashlightFit(flashlights, _weighted(evidence, misfit), weight, priors, free_tangent),
         misfit,
     )

@@ -57,6 +57,11 @@ BY_CUES = (
     "lights: from the outlines of shadows and object, their common scale from {}. This phone or flashlight changes "
     "brightness from place to place, so shading alone would misplace them"
 )
+AMBIGUOUS = 0.1  # of a light's distance, between fits that are about as likely: the user is told
+BY_SEVERAL = (
+    ". Several placements of the lights explain these photos about as well; they lie {:.0%} of its distance about "
+    "the one that was taken. A photo from the side, the object's height, or photos in light/ decide between them"
+)
 COLOUR_STEPS = LAST[:4]  # the channels differ from their mean by a few per cent: few steps suffice
 
 
@@ -208,6 +213,14 @@ def surely_placed(found: LightFit, centre: Float[np.ndarray, "3"]) -> float:
     return float(np.mean(np.array([light.used for light in found.lights]) & (sigma < LARGEST_SIGMA * reach)))
 
 
+def told_doubt(fit: FlashlightFit) -> str:
+    """Return what to add to the sentence about the lights where fits that are about as likely lie far apart, or ""."""
+    reach = np.linalg.norm(fit.flashlights.positions - fit.evidence.cells.centre, axis=1)
+    between = np.broadcast_to(fit.between, fit.flashlights.positions.shape)
+    apart = float(np.median(np.sqrt(between.sum(1)) / reach))
+    return BY_SEVERAL.format(apart) if apart > AMBIGUOUS else ""
+
+
 def locate_lights(
     stack: PhotoStack,
     posed_camera: PosedCamera,
@@ -257,5 +270,5 @@ def locate_lights(
     by_outlines, by_shading = (np.mean([light.used for light in one.lights]) for one in (other, found))
     if by_outlines < min(FEWEST_USED, by_shading):
         return found
-    cue = BY_CUES.format(cues.sentence()) if cues else BY_OUTLINES
+    cue = (BY_CUES.format(cues.sentence()) if cues else BY_OUTLINES) + told_doubt(joint)
     return replace(other, residuals=other.residuals | {"tone": tone.document(), "cue": cue})

@@ -2,8 +2,8 @@
 
 A phone that lifts shadows or bends contrast, and a hot beam, make the shading of each photo misleading. Outlines do not
 depend on brightness. They leave four numbers free that all lights share (the silhouette fixes three of these loosely);
-the shading of all photos together decides them (common_motion). Then everything is refitted together, with shading
-trusted only as far as its own misfit allows. Photos whose shadows the picture cuts are located last.
+the shading of all photos together decides them (common_motion). Both are fitted together from rough starts, with
+shading trusted only as far as its own misfit allows. Photos whose shadows the picture cuts are located last.
 """
 
 from dataclasses import replace
@@ -17,10 +17,9 @@ from calibration.flashlight.common_motion import (
     CONTRASTS,
     LOOSE,
     at_best_contrast,
-    best_common_motion,
-    contradiction,
+    searched,
 )
-from calibration.flashlight.fit import FAR, NEAR, FlashlightFit
+from calibration.flashlight.fit import FAR, MIN_GROUND, NEAR, FlashlightFit
 from calibration.flashlight.model import (
     PER_FLASHLIGHT,
     Evidence,
@@ -33,7 +32,6 @@ from calibration.flashlight.model import (
 from calibration.ground.ground_field import at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows, find_shadows, of_one_ground
 from calibration.ground.mirror_highlights import find_highlights
-from calibration.outlines.fit import fit_outlines
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
 from calibration.outlines.outline_maps import near_ground, outline_maps, with_cues
 from calibration.outlines.relocate import likely_places
@@ -62,7 +60,7 @@ def with_outlines(
     by_shading: Float[np.ndarray, "photos 3"],
     cues: MetricCues = NO_CUES,
 ) -> FlashlightFit | None:
-    """Return the joint fit, world frame; None where no object or too few shadows are in sight.
+    """Return the joint fit, world frame; None without an object, enough shadows, or ground that follows.
 
     Args:
         evidence: of the used photos, before any fit.
@@ -87,29 +85,20 @@ def with_outlines(
     spots = find_highlights(coarse, find_shadows(coarse), points, near)
     terms = OutlineTerms(maps, eye, ground, every, whole, spots)
     cells = replace(_lit_cells(evidence, shadows, posed_camera), outlines=terms)
-    # outlines alone hardly tell how tall the object is, nor lights that are all several times too near: shading does
-    tries = [(fit_outlines(terms, one), one) for one in (*starts, by_shading)]
-    lights, start = min(tries, key=lambda one: contradiction(one[0], cells))
-    lights = _without_strays(lights, start, terms)
-    fit = best_common_motion(lights, cells)
-    complete = _with_strays(fit, start, by_shading, whole)
+    starts.append(by_shading)
+    fit, number = searched(starts, cells)
+    if _ground(fit) < MIN_GROUND / THIN:
+        return None
+    complete = _with_strays(fit, starts[number], by_shading, whole)
     # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share
     contrasts = (1.0,) if stack.is_linear else CONTRASTS
-    return at_best_contrast(complete.flashlights, replace(cells, outlines=complete.evidence.outlines), contrasts)
+    found = at_best_contrast(complete.flashlights, replace(cells, outlines=complete.evidence.outlines), contrasts)
+    return replace(found, between=found.between + fit.between) if _ground(found) >= MIN_GROUND / THIN else None
 
 
-def _without_strays(
-    lights: Float[np.ndarray, "photos 3"], start: Float[np.ndarray, "photos 3"], terms: OutlineTerms
-) -> Float[np.ndarray, "photos 3"]:
-    """Look again for trusted lights that contradict the others: one in a wrong place holds all others in theirs."""
-    strays = terms.trusted & _is_stray(terms, lights)
-    if not strays.any():
-        return lights
-    for k in np.flatnonzero(strays).tolist():
-        alone = terms.trusted & (~strays | (np.arange(len(strays)) == k))
-        lights = lights.copy()
-        lights[k] = likely_places(replace(terms, trusted=alone), lights, k, np.stack([start[k], lights[k]]))[0]
-    return fit_outlines(terms, lights)
+def _ground(fit: FlashlightFit) -> int:
+    """Return how many ground cells follow the lights."""
+    return int((fit.weight.sum(0) > 0).sum())
 
 
 def _is_stray(terms: OutlineTerms, places: Float[np.ndarray, "photos 3"]) -> Bool[np.ndarray, " photos"]:

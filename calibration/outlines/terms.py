@@ -27,17 +27,14 @@ class OutlineTerms:
     used: Bool[np.ndarray, " photos"]  # of all photos of the maps: those of the fit
     trusted: Bool[np.ndarray, " used"]  # of the fit's photos: the others neither prove space empty nor count
     highlights: MirrorHighlights | None = None  # numbered as the maps' photos
+    blur: float = 1.0  # factor of an outline's sigma, for a search that begins far from the answer
     _looks: list[tuple[np.ndarray, np.ndarray, Residuals]] = field(default_factory=list, init=False)
 
-    def rows(self, positions: Float[np.ndarray, "used 3"], blur: float = 1.0):
-        """Return residuals in sigmas, Cauchy's weight applied, and derivatives (rows, used, 3) by the positions.
-
-        Args:
-            blur: factor of an outline's sigma, for a search that begins far from the answer.
-        """
+    def rows(self, positions: Float[np.ndarray, "used 3"]):
+        """Return residuals in sigmas, Cauchy's weight applied, and derivatives (rows, used, 3) by the positions."""
         order = self._order(len(positions))
         found = self._look(positions, self.trusted)
-        sigma = PIXEL_ERROR * self.maps.pixel * blur
+        sigma = PIXEL_ERROR * self.maps.pixel * self.blur
         active = found.emptiness > 0
         size = found.emptiness[active] / sigma
         root = 1 / np.sqrt((1 + size**2) * SAME)
@@ -74,10 +71,10 @@ class OutlineTerms:
         """Return how much nearer or farther than usual in this series each light is, in sigmas."""
         return self._arms(positions)[1]
 
-    def cost(self, positions: Float[np.ndarray, "used 3"], blur: float = 1.0) -> float:
+    def cost(self, positions: Float[np.ndarray, "used 3"]) -> float:
         """Return half the sum of squares whose weighted rows `rows` gives: Cauchy's function."""
         found = self._look(positions, self.trusted)
-        size = np.maximum(found.emptiness, 0) / (PIXEL_ERROR * self.maps.pixel * blur)
+        size = np.maximum(found.emptiness, 0) / (PIXEL_ERROR * self.maps.pixel * self.blur)
         return float(np.log1p(size**2).sum() / (2 * SAME)) + self._other_cost(positions)
 
     def costs(
