@@ -95,6 +95,18 @@ def carve(out, needed, known, origin, spacing, lights, maps, field_origin, cell,
     _carve(out, needed, known, origin, spacing, lights, field, ground, np.empty(votes), start, stop)
 
 
+@njit(forceinline=True, **INNER)
+def _insert(best, value):
+    """Insert a value into the largest ones, if it is one of them."""
+    m = len(best) - 1
+    if value <= best[m]:
+        return
+    while m > 0 and best[m - 1] < value:
+        best[m] = best[m - 1]
+        m -= 1
+    best[m] = value
+
+
 @njit(**INNER)
 def _carve(out, needed, known, origin, spacing, lights, field, ground, best, start, stop):
     """Do the work of carve; `best` holds the largest distances of a node."""
@@ -130,13 +142,7 @@ def _carve(out, needed, known, origin, spacing, lights, field, ground, best, sta
                     count += dark[n, int(gx + 0.5), int(gy + 0.5)]
                     sine = dz / math.sqrt(dx * dx + dy * dy + dz * dz)
                     value *= sine / (1 + w * max(u, -0.5))
-                    m = votes - 1
-                    if value <= best[m]:
-                        continue
-                    while m > 0 and best[m - 1] < value:
-                        best[m] = best[m - 1]
-                        m -= 1
-                    best[m] = value
+                    _insert(best, value)
                     if best[votes - 1] > enough:
                         break
                 out[i, j, k] = best[votes - 1]
