@@ -187,25 +187,31 @@ def _lit_for(pixel, level, guess, weight):
 
 
 @njit(**INNER)
-def _best_start(pixel, prior, has_guess, weights, scratch):
+def _best_start(pixel, prior, has_guess, rounds, weights, scratch):
     """Return albedo * normal of the most probable of three starts, and leave the weights in the first row."""
-    dark, variance = scratch[0], scratch[1]
-    value, usable, rows = pixel[0], pixel[1], pixel[3]
-    _bright(value, usable, rows[3], weights[0])
-    best = _reweighted(pixel, (NOTHING, NOTHING, NOTHING, WIDE, False), prior, ROUNDS, weights[0], dark, variance)
-    cost, level = _improbability(pixel, best, prior, dark, variance), prior[0]
-    _, x, y, z = _length_and_normal(best[0], best[1], best[2])
-    for number in range(1 + has_guess):
-        guess = prior[1] if number else (x, y, z)
-        middle = _lit_for(pixel, level, guess, weights[1])
-        first = guess if number else middle
-        start = (level * first[0], level * first[1], level * first[2], NEAR, True)
-        other = _reweighted(pixel, start, prior, ROUNDS, weights[1], dark, variance)
+    dark, variance, own, kept = scratch[0], scratch[1], weights[1], weights[0]
+    value, usable, rows, level = pixel[0], pixel[1], pixel[3], prior[0]
+    x = y = z = NOTHING
+    best, cost = (x, y, z), 0.0
+    for number in range(2 + has_guess):
+        first, widest = (x, y, z), NEAR
+        if number == 0:
+            _bright(value, usable, rows[3], own)
+            widest = WIDE
+        elif number == 1:
+            first = _lit_for(pixel, level, first, own)
+        else:
+            first = prior[1]
+            _lit_for(pixel, level, first, own)
+        start = (level * first[0], level * first[1], level * first[2], widest, number > 0)
+        other = _reweighted(pixel, start, prior, rounds, own, dark, variance)
         other_cost = _improbability(pixel, other, prior, dark, variance)
-        if other_cost < cost:
+        if number == 0:
+            _, x, y, z = _length_and_normal(other[0], other[1], other[2])
+        if number == 0 or other_cost < cost:
             best, cost = other, other_cost
             for k in range(len(value)):
-                weights[0, k] = weights[1, k]
+                kept[k] = own[k]
     return best
 
 
@@ -230,10 +236,11 @@ def fit_pixels(samples, towards, bounce, stray, albedos, guesses, kind, room, so
         kind: 0: one start from bright samples, without a prior; 1 and 2: the best of two or three starts, the third
             from the guess; from 3, `kind` rounds from the given solution and weights, with a prior for normals.
         room: (8, photos), for what is computed of a pixel.
-        solved, weights: (pixels, 3), (pixels, photos): filled in.
+        solved, weights: (pixels, 3), (pixels, photos): filled in; 0 at first, unless they are given.
     """
     photos = towards.shape[1]
     rows, scratch, own = room[:4], room[4:6], room[6:]
+    rounds, widest = (ROUNDS, WIDE) if kind < 3 else (kind, NEAR)
     for i in range(start, stop):
         value, usable, given, sky = _read(samples, towards, i, rows)
         pixel = (value, usable, given, rows, sky, bounce, stray)
@@ -241,16 +248,15 @@ def fit_pixels(samples, towards, bounce, stray, albedos, guesses, kind, room, so
         known = kind > 1 and (guess[0] != 0 or guess[1] != 0 or guess[2] != 0)
         prior = (albedos[i], guess, known)
         if 1 <= kind <= 2:
-            found = _best_start(pixel, prior, kind - 1, own, scratch)
+            found = _best_start(pixel, prior, kind - 1, rounds, own, scratch)
         else:
-            first = (solved[i, 0], solved[i, 1], solved[i, 2], NEAR, False)
             if kind == 0:
-                first = (NOTHING, NOTHING, NOTHING, WIDE, False)
                 _bright(value, usable, rows[3], own[0])
             else:
                 for k in range(photos):
                     own[0, k] = weights[i, k]
-            found = _reweighted(pixel, first, prior, ROUNDS if kind == 0 else kind, own[0], scratch[0], scratch[1])
+            first = (solved[i, 0], solved[i, 1], solved[i, 2], widest, kind < 0)
+            found = _reweighted(pixel, first, prior, rounds, own[0], scratch[0], scratch[1])
         solved[i, 0], solved[i, 1], solved[i, 2] = found
         for k in range(photos):
             weights[i, k] = own[0, k]
