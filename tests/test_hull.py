@@ -15,6 +15,7 @@ from calibration.side_view import SideView
 from capture.errors import ReconstructionError
 from reconstruct.initialization.shadow_hull import shadow_hull
 from reconstruct.labels.labels import assemble_labels
+from reconstruct.sdf import carve_kernels
 
 LOOK = Look(with_shadow=True, with_mask=True, n_lights=24)
 
@@ -123,3 +124,16 @@ def test_a_hanging_object_that_pixels_need_stays():
     grid = shadow_hull(scene, labels_of(scene), votes=1, nodes=48)
     for ball in pair:
         assert float(grid.sdf(torch.tensor([ball.centre]))) < 0
+
+
+@pytest.mark.parametrize("votes", [1, 2])
+def test_nodes_that_the_camera_proves_empty_need_no_light(monkeypatch, votes):
+    scene, _ = render(HEAP, LOOK)
+    grid = shadow_hull(scene, labels_of(scene), votes=votes, nodes=32)
+    kernel = carve_kernels.carve
+    nothing = np.zeros((0, 0, 0), np.float32)
+    monkeypatch.setattr(carve_kernels, "carve", lambda out, needed, known, *rest: kernel(out, needed, nothing, *rest))
+    whole = shadow_hull(scene, labels_of(scene), votes=votes, nodes=32)
+    np.testing.assert_array_equal(np.sign(grid.values), np.sign(whole.values))
+    near = whole.values.abs() < grid.spacing
+    assert torch.equal(grid.values[near], whole.values[near])

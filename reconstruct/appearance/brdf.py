@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 LOBES = 9  # [ShadowNeuS, supplement]
@@ -79,14 +79,20 @@ def lobes_and_factors(
     towards: Float[Tensor, "*#batch 3"],
     eye: Float[Tensor, "*#batch 3"],
     blur: float = 0.0,
+    used: Bool[Tensor, " every"] | None = None,
 ) -> tuple[Float[Tensor, "*#batch lobes"], Float[Tensor, "*#batch"], Float[Tensor, "*#batch"]]:
     """Return D_k and both results of `shape_factors`: what of `specular` does not depend on the coefficients.
 
     Args:
         normals, towards, eye, blur: as of `specular`.
+        used: which of the nine lobes are wanted; None: all.
     """
     halfway = torch.nn.functional.normalize(towards + eye, dim=-1)
-    values = lobe_values(normals, halfway) if blur == 0 else _widened(normals, halfway, towards, blur)
+    sharpness = torch.tensor(SHARPNESS, device=normals.device, dtype=normals.dtype)
+    sharpness = sharpness if used is None else sharpness[used]
+    if blur > 0:
+        return _widened(normals, halfway, towards, blur, sharpness), *shape_factors(normals, halfway, towards, eye)
+    values = lobe_values(normals, halfway, sharpness)
     return values, *shape_factors(normals, halfway, towards, eye)
 
 
@@ -120,13 +126,13 @@ def specular(
         towards, eye: unit directions from the surface to the light and to the camera.
         blur: angle between the lights of an environment map, rad; sharper lobes are widened, their reflectance kept.
     """
-    values, factor, grazing = lobes_and_factors(normals, towards, eye, blur)
-    return (values[..., None, :] @ coefficients)[..., 0, :] * fresnel(factor, grazing, coefficients)
+    used = coefficients.any(-1).reshape(-1, LOBES).any(0)
+    values, factor, grazing = lobes_and_factors(normals, towards, eye, blur, used)
+    return (values[..., None, :] @ coefficients[..., used, :])[..., 0, :] * fresnel(factor, grazing, coefficients)
 
 
-def _widened(normals: Tensor, halfway: Tensor, towards: Tensor, blur: float) -> Tensor:
+def _widened(normals: Tensor, halfway: Tensor, towards: Tensor, blur: float, sharpness: Tensor) -> Tensor:
     """Limit the lobes' sharpness to lights `blur` rad apart; half vectors are closer together by 1 / (2 l . h)."""
-    sharpness = torch.tensor(SHARPNESS, dtype=normals.dtype)
     turn = blur / (2 * (towards * halfway).sum(-1, keepdim=True).clamp(GRAZING, 1))
     wide = torch.minimum(sharpness, 1 / (SAMPLING * turn**2))
     return lobe_values(normals, halfway, wide) * (wide / sharpness)

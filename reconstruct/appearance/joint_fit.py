@@ -10,25 +10,23 @@ no lobes, photos of the stated power keep it.
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from reconstruct.appearance.brdf import LOBES, specular
+from reconstruct.appearance import joint_kernels
+from reconstruct.appearance.brdf import DIELECTRIC, LOBES, SHARPNESS, facing_reflectance, specular
+from reconstruct.appearance.joint_kernels import DUST
 from reconstruct.appearance.lobe_fit import LEAST_GAIN, Samples, highlights, least_squares_albedo, shared_lobes
+from reconstruct.sdf.rays import run
 
 ROUNDS, MATT_ROUNDS = 10, 3  # of fitting in turn; without lobes nothing slow is left to settle
 STEPS, LAST_STEPS = 4, 12  # Gauss-Newton steps in a round, and of pixels that see finished lobes
 FEWEST_PHOTOS = 8  # fewer do not tell a power from the normals
-MODEL_SHARE, STRAY_SHARE = 0.03, 0.02  # one sigma: of the value, and of the pixel's brightest prediction
-WIDTH, HIGHLIGHT_PATIENCE = 2.5, 1.5  # sigmas that an outlier is off (Geman-McClure); times wider above the prediction
 POWER_PRIOR = 0.02  # pull of the stated powers, in every round
 SURELY_FACING = 0.25  # cosine to the light of samples that tell its power
 MOST_OFF = 5.0  # ratio of seen to expected that a power is read from, either way
-STEP, MOST_TURNED = 1e-3, 0.3  # rad: of numerical slopes, and the largest turn in a step
-FIRST_DAMPING, EASED, DAMPED = 1e-2, 0.3, 5.0  # Levenberg-Marquardt: at first, times after a good and after a bad step
-DUST = 1e-5
 
 
 @dataclass(frozen=True)
@@ -97,50 +95,38 @@ def fit_normals(
     """Fit unit world normals and grey albedos of pixels whose lobes are known; also return each pixel's cost.
 
     Minimises sum_k rho((I_k - albedo (E_k n.l_k + indirect_k) - specular(n) E_k n.l_k) / sigma_k) by
-    Levenberg-Marquardt steps over two angles and the log of the albedo, with rho of Geman and McClure.
+    Levenberg-Marquardt steps over two angles and the log of the albedo, with rho of Geman and McClure, until each pixel
+    rests or `steps` are done.
 
     Args:
         samples: with the normals to begin from.
         noise: as of `fit_material`.
     """
-    normals, value = samples.normals, samples.value.mean(-1)
+    value = samples.value.mean(-1)
     diffuse = samples.value - highlights(samples, lobes)
-    lit = (samples.towards * normals[:, None]).sum(-1, keepdim=True).clamp(min=0) * samples.strength + samples.indirect
+    facing = (samples.towards * samples.normals[:, None]).sum(-1, keepdim=True).clamp(min=0)
+    lit = facing * samples.strength + samples.indirect
     albedo = least_squares_albedo(diffuse, lit, samples.weight).mean(-1).clamp(min=DUST)
-    damping = torch.full((len(value), 1, 1), FIRST_DAMPING)
-    weight, cost = _judged(samples, noise, _predicted(samples, normals, albedo, lobes))
-    for _ in range(steps):
-        matrix, right, (across, along) = _equations(samples, normals, albedo, lobes, weight)
-        damped = matrix + damping * torch.diag_embed(matrix.diagonal(dim1=1, dim2=2) + STEP)
-        move = torch.linalg.solve(damped, right).clamp(-MOST_TURNED, MOST_TURNED)
-        turned = normalize(normals + move[:, :1] * across + move[:, 1:2] * along, dim=-1)
-        scaled = (albedo * move[:, 2].exp()).clamp(min=DUST)
-        other_weight, other_cost = _judged(samples, noise, _predicted(samples, turned, scaled, lobes))
-        better = other_cost < cost
-        normals, albedo = torch.where(better[:, None], turned, normals), torch.where(better, scaled, albedo)
-        weight, cost = torch.where(better[:, None], other_weight, weight), torch.where(better, other_cost, cost)
-        damping = damping * torch.where(better, EASED, DAMPED)[:, None, None]
+    usable = (samples.weight > 0).to(value.dtype)
+    seen = torch.stack([value, noise, usable], -1)
+    light = torch.stack([samples.strength.mean(-1), samples.indirect.mean(-1)], -1)
+    given = [_array(x) for x in (seen, light, samples.towards, samples.eye)]
+    found = [_array(x).copy() for x in (samples.normals, albedo)]
+    costs = np.empty_like(found[1])
+    run(joint_kernels.fit_pixels, len(costs), *given, _grey_lobes(lobes), steps, *found, costs)
+    normals, albedo, cost = (torch.from_numpy(x) for x in (*found, costs))
     return normals, albedo, cost
 
 
-def _equations(
-    samples: Samples,
-    normals: Float[Tensor, "n 3"],
-    albedo: Float[Tensor, " n"],
-    lobes: Float[Tensor, "lobes 3"],
-    weight: Float[Tensor, "n photos"],
-) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"], tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]]:
-    """Return the weighted normal equations of two angles and log albedo, and the directions of the angles."""
-    aside = torch.zeros_like(normals)
-    aside.scatter_(1, normals.abs().argmin(1, keepdim=True), 1.0)
-    across = normalize(torch.linalg.cross(aside, normals), dim=-1)
-    along = torch.linalg.cross(normals, across)
-    now = _predicted(samples, normals, albedo, lobes)
-    turned = [normalize(normals + STEP * way, dim=-1) for way in (across, along)]
-    slopes = [(_predicted(samples, other, albedo, lobes) - now) / STEP for other in turned]
-    rows = torch.stack([*slopes, albedo[:, None] * _arriving(samples, normals)], -1)
-    heavy = (rows * weight[..., None]).transpose(1, 2)
-    return heavy @ rows, (heavy @ (samples.value.mean(-1) - now)[..., None])[..., 0], (across, along)
+def _array(values: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(values.numpy(), np.float32)
+
+
+def _grey_lobes(lobes: Float[Tensor, "lobes 3"]) -> Float[np.ndarray, "some 3"]:
+    """Return each used lobe's sharpness, coefficient, and Fresnel's part of it at grazing light; means of RGB."""
+    rest = 1 / facing_reflectance(lobes).clamp(DIELECTRIC, 1) - 1
+    every = torch.stack([torch.tensor(SHARPNESS), lobes.mean(-1), (lobes * rest).mean(-1)], -1)
+    return every[lobes.any(-1)].double().numpy()
 
 
 def _arriving(samples: Samples, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n photos"]:
@@ -158,16 +144,3 @@ def _predicted(
     cosine = (samples.towards * normals[:, None]).sum(-1).clamp(min=0)
     mirrored = specular(lobes, normals[:, None], samples.towards, samples.eye[:, None]).mean(-1)
     return diffuse + mirrored * cosine * samples.strength.mean(-1)
-
-
-def _judged(
-    samples: Samples, noise: Float[Tensor, "n photos"], expected: Float[Tensor, "n photos"]
-) -> tuple[Float[Tensor, "n photos"], Float[Tensor, " n"]]:
-    """Return the weight of each sample, over its variance, and the cost of each pixel."""
-    value = samples.value.mean(-1)
-    stray = STRAY_SHARE * expected.amax(1, keepdim=True)
-    variance = noise**2 + (MODEL_SHARE * value) ** 2 + stray**2
-    width = torch.where(value > expected, HIGHLIGHT_PATIENCE * WIDTH, WIDTH)
-    off = (value - expected) ** 2 / (variance * width**2)
-    usable = (samples.weight > 0).float()
-    return usable / (variance * (1 + off) ** 2), (usable * width**2 * off / (1 + off)).sum(1)

@@ -65,7 +65,7 @@ def fit_detail(
         usable = samples.weight * (gloss <= MOST_GLOSS * value)
         pixels = _pixels(samples, value - gloss, usable > 0, noise)
         first = albedo[:, None] * samples.normals
-        solved, weight = robust_normals(pixels, usable, Prior(albedo, samples.normals), first, False, ROUNDS)
+        solved, weight = robust_normals(pixels, usable, Prior(albedo, samples.normals), first, ROUNDS)
         normals, agreeing = normalize(solved, dim=-1), weight.sum(1)
         trust = ((agreeing - FEWEST_AGREEING) / (ENOUGH_AGREEING - FEWEST_AGREEING)).clamp(0, 1)
         strange = ((normals * samples.normals).sum(-1) < MOST_TURNED) | ((normals * samples.eye).sum(-1) <= 0)

@@ -116,21 +116,21 @@ def carve_grid(
     shape = np.maximum(np.ceil((upper - lower) / spacing).astype(int) + 1, 4)
     by_lights, by_camera = np.empty(shape, np.float32), np.empty(shape, np.float32)
     needed, unused = np.empty(shape, np.uint8), np.empty(shape, np.uint8)
-    for out, count, which, k in (
-        (by_lights, needed, slice(0, -len(views)), votes),
-        (by_camera, unused, slice(-len(views), None), 1),
+    nothing = np.zeros((0, 0, 0), np.float32)
+    for out, count, known, which, k in (
+        (by_camera, unused, nothing, slice(-len(views), None), 1),  # first: it proves most of the box empty
+        (by_lights, needed, by_camera, slice(0, -len(views)), votes),
     ):
         run(
             carve.carve,
             int(shape[0]),
             out,
             count,
+            known,
             lower.astype(float),
             spacing,
             maps.lights[which],
-            maps.fields[which],
-            maps.dark[which],
-            maps.heights,
+            (maps.fields[which], maps.dark[which], maps.heights),
             maps.origin,
             maps.cell,
             views[0][0].ground_height,

@@ -12,15 +12,8 @@ from reconstruct.labels.outline import dilated, local_mean
 from reconstruct.scene import Scene, grey_irradiance, grey_of
 from reconstruct.shading.joint_normals import Picture, fit_together
 from reconstruct.shading.noise import DEFAULT_NOISE, Noise
-from reconstruct.shading.normal_fit import (
-    INDIRECT_SHARE,
-    MODEL_SHARE,
-    Pixels,
-    Prior,
-    fit_normals,
-    indirect_light,
-    misfit,
-)
+from reconstruct.shading.normal_fit import MODEL_SHARE, Pixels, Prior, fit_normals, indirect_light, misfit
+from reconstruct.shading.normal_kernels import INDIRECT_SHARE
 
 CHUNK = 8192  # pixels at once: 40 photos of them stay near the processor
 DARKER_DOUBT = 1.0  # log ratio to the neighbours' albedo at which a darker fit is no longer trusted

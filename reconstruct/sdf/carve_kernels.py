@@ -10,6 +10,7 @@ from reconstruct.sdf.kernels import FAST, INNER, UNCOUNTED
 NEVER = -1e9
 CROSSING_STEPS = 12  # of a fixed point that contracts by slope * cot(elevation)
 SETTLED = 0.02  # cells: a crossing that moves by less has converged
+SURELY_EMPTY = 3.0  # nodes outside a cone: no crossing lies beside such a node, and no further light is asked
 CROSSING_ERROR = 0.5  # cells: a crossing that still moves by more is not used
 
 
@@ -74,8 +75,10 @@ def above_ground(lit, points, lights, heights, origin, cell, top, skip, start, s
 
 
 @njit(**FAST)
-def carve(out, needed, origin, spacing, lights, fields, dark, heights, field_origin, cell, ground, votes, start, stop):
+def carve(out, needed, known, origin, spacing, lights, maps, field_origin, cell, ground, votes, start, stop):
     """Compute each node's votes-th largest distance to the shadow cones of the lights; positive = proven empty.
+
+    Where it is more than SURELY_EMPTY nodes, it is a smaller one that is as sure, and `needed` is not counted.
 
     A node x is projected from light q to the ground; the signed distance there to the edge of the lit ground, scaled
     back to x (r_x / r_ground) and foreshortened (sine of the elevation), is how far x lies outside the shadow cone.
@@ -83,20 +86,32 @@ def carve(out, needed, origin, spacing, lights, fields, dark, heights, field_ori
     Args:
         out, needed: (nx, ny, nz) nodes, slabs start .. stop - 1 are filled; needed counts the lights under which the
             node's shadow would fall on ground that is seen to be dark. origin, spacing: world.
-        fields: (lights, gx, gy) signed distance inside lit ground, world length, at field_origin + cell * (i, j).
-        dark: (lights, gx, gy) ground seen in shadow.
-        heights: (gx, gy) of uneven ground on the nodes of fields; empty for a plane.
+        known: such distances that already prove nodes empty; empty if nothing does.
+        maps: fields, (lights, gx, gy) signed distance inside lit ground, world length, at field_origin + cell * (i, j);
+            dark, the same of ground seen in shadow; heights, (gx, gy) of uneven ground there, empty for a plane.
         ground: height of the ground plane.
     """
-    field = (fields, dark, heights, field_origin, cell)
-    _carve(out, needed, origin, spacing, lights, field, ground, np.empty(votes), start, stop)
+    field = (*maps, field_origin, cell)
+    _carve(out, needed, known, origin, spacing, lights, field, ground, np.empty(votes), start, stop)
+
+
+@njit(forceinline=True, **INNER)
+def _insert(best, value):
+    """Insert a value into the largest ones, if it is one of them."""
+    m = len(best) - 1
+    if value <= best[m]:
+        return
+    while m > 0 and best[m - 1] < value:
+        best[m] = best[m - 1]
+        m -= 1
+    best[m] = value
 
 
 @njit(**INNER)
-def _carve(out, needed, origin, spacing, lights, field, ground, best, start, stop):
+def _carve(out, needed, known, origin, spacing, lights, field, ground, best, start, stop):
     """Do the work of carve; `best` holds the largest distances of a node."""
     fields, dark, heights, field_origin, cell = field
-    votes = len(best)
+    votes, enough = len(best), SURELY_EMPTY * spacing
     _, ny, nz = out.shape
     for i in range(start, stop):
         x = origin[0] + i * spacing
@@ -104,6 +119,9 @@ def _carve(out, needed, origin, spacing, lights, field, ground, best, start, sto
             y = origin[1] + j * spacing
             for k in range(nz):
                 z = origin[2] + k * spacing
+                if known.size > 0 and known[i, j, k] > enough:
+                    out[i, j, k], needed[i, j, k] = known[i, j, k], 0
+                    continue
                 best[:] = NEVER
                 count = 0
                 for n in range(len(lights)):
@@ -124,12 +142,8 @@ def _carve(out, needed, origin, spacing, lights, field, ground, best, start, sto
                     count += dark[n, int(gx + 0.5), int(gy + 0.5)]
                     sine = dz / math.sqrt(dx * dx + dy * dy + dz * dz)
                     value *= sine / (1 + w * max(u, -0.5))
-                    m = votes - 1
-                    if value <= best[m]:
-                        continue
-                    while m > 0 and best[m - 1] < value:
-                        best[m] = best[m - 1]
-                        m -= 1
-                    best[m] = value
+                    _insert(best, value)
+                    if best[votes - 1] > enough:
+                        break
                 out[i, j, k] = best[votes - 1]
                 needed[i, j, k] = min(count, 255)

@@ -24,13 +24,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
-from reconstruct.shading.normal_fit import (
-    NORMAL_SIGMA,
-    TAIL,
-    Pixels,
-    bounded,
-    indirect_light,
-)
+from reconstruct.shading.normal_fit import Pixels, bounded, indirect_light
+from reconstruct.shading.normal_kernels import NORMAL_SIGMA, TAIL
 
 SAMPLE = 0.2  # of its cost: errors of Lambert's law, as gloss makes them, are common to a pixel and its neighbours
 SHADOWED = 1.5  # -2 log of the odds of a cast shadow on a pixel that faces its light: one in two among few photos
