@@ -89,7 +89,7 @@ def _likelihood(field: GroundField, dark: Float[np.ndarray, " photos"]) -> Float
     return cv2.GaussianBlur((total / np.maximum(count, 1)).astype(np.float32), (0, 0), 0.7)
 
 
-def gaussian(values: np.ndarray, sigma: float) -> np.ndarray:
+def gaussian(values: np.ndarray, sigma: float | np.ndarray) -> np.ndarray:
     """Return the density of a normal distribution around 0."""
     return np.exp(-0.5 * (values / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
 

@@ -3,12 +3,13 @@
 The light of one lamp on one plane is smooth, but for shadows. Where another surface begins, a floor below or a wall,
 its distance or its slope is another one: along that line the brightness changes by a step, and by another step in each
 photo, since the lamp stands elsewhere. The step of an albedo is the same in all photos, and the edge of a shadow lies
-along a line in few of them. So a line is looked for along which the step, taken from the brightness over its median
-over all photos, differs most between the photos. What lies beyond is no ground: its light comes to another height.
+along a line in few of them. So a line is looked for along which the step of the brightness differs most between the
+photos. What lies beyond is no ground: its light comes to another height.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -22,8 +23,10 @@ NEARBY = np.radians(np.arange(-4, 5))  # angles that are tried around the one th
 STRIP = 2  # px wide, on each side of a line: the step is the difference of their means
 GAP = 1  # px between them
 AROUND = 12  # px of the finer picture on each side of the line that was found
-LEAST_STEP = 0.12  # log units, spread of the steps over photos: ten edges and walls show .18 to .5, lines across tables
-# at most .02, and across a large object .04 to .08
+# Log units, spread of the steps over photos: eight edges and walls show .19 to .41, other lines at most .02 on open
+# tables and .05 across objects.
+LEAST_STEP = 0.1
+PARTS = 2  # of a line, both of which must show the step: the step's sign may change along it
 FEWEST_PHOTOS = 4  # and half of all, that show a step
 LEAST_LENGTH = 0.25  # of the picture's width
 MOST_PHOTOS = 24
@@ -148,11 +151,18 @@ def _steps(level: np.ndarray, angle: float, offset: float, reach: int) -> tuple[
     step = strip[:, apart:] - strip[:, :-apart]
     step = step[:, apart:-apart] - (step[:, : -2 * apart] + step[:, 2 * apart :]) / 2
     long_enough = np.isfinite(step).sum(2) > LEAST_LENGTH * width
-    typical = np.where(long_enough, _median(step, 2), np.nan)
-    spread = 1.4826 * _median(np.abs(typical - _median(typical, 0)), 0)
+    typical = np.stack([_median(step[:, :, part], 2) for part in _parts(np.isfinite(step).any((0, 1)))])
+    spread = np.nan_to_num(1.4826 * _median(np.abs(typical - _median(typical, 1)[:, None]), 1)).min(0)
     spread[long_enough.sum(0) < max(FEWEST_PHOTOS, n / 2)] = 0
     best = int(np.argmax(spread))
     return float(spread[best]), offset - reach + best + apart + STRIP + (GAP - 1) / 2
+
+
+def _parts(known: Bool[np.ndarray, " columns"]) -> list[slice]:
+    """Divide the columns from the first known one to the last into parts of one length."""
+    ends = np.flatnonzero(known)
+    cuts = np.linspace(ends[0], ends[-1] + 1, PARTS + 1).astype(int) if len(ends) else np.zeros(PARTS + 1, int)
+    return [slice(low, max(high, low + 1)) for low, high in pairwise(cuts)]
 
 
 def _on_ground(line: Line, points: np.ndarray, eye: np.ndarray, shape: tuple[int, ...]) -> TableEdge | None:
@@ -169,7 +179,7 @@ def _on_ground(line: Line, points: np.ndarray, eye: np.ndarray, shape: tuple[int
         return None
     across = np.linalg.svd(at - at.mean(0), full_matrices=False)[2][1]
     edge = TableEdge(across, float(across @ at.mean(0)))
-    return edge if edge.on_table(eye) else TableEdge(-across, -edge.offset)
+    return edge if edge.on_table(eye[None]).all() else TableEdge(-across, -edge.offset)
 
 
 def _at_pixels(points: np.ndarray, shape: tuple[int, ...]) -> Float[np.ndarray, "height width 3"]:
