@@ -1,5 +1,6 @@
 """Fit the flashlight of every photo: a coarse search, then a robust fit that handles gloss and stray photos."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from calibration.flashlight.model import (
     log_irradiance,
     refine,
 )
+from calibration.ground.table_edges import TableEdge, on_table
 from calibration.lights.ground_cells import GroundCells, sample_ground
 from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
@@ -78,6 +80,12 @@ def collect(
     evidence = Evidence.of(cells, np.array(stack.gains)[photos], posed_camera.ground_height)
     refuse_still_light(evidence)
     return evidence, photos
+
+
+def before_ends(evidence: Evidence, edges: Sequence[TableEdge]) -> Evidence:
+    """Return the evidence without the cells beyond the ground's ends; as it is where too few would be left."""
+    inside = on_table(edges, evidence.cells.points)
+    return replace(evidence, weight=evidence.weight * inside) if inside.sum() >= MIN_GROUND else evidence
 
 
 def hemisphere(cells: GroundCells) -> list[Float[np.ndarray, "candidates 3"]]:

@@ -11,6 +11,7 @@ from calibration.flashlight.duplicates import earlier_duplicate
 from calibration.flashlight.fit import (
     LAST,
     FlashlightFit,
+    before_ends,
     collect,
     first_guess,
     fit_flashlights,
@@ -31,7 +32,6 @@ from calibration.flashlight.model import (
 from calibration.flashlight.outline_lights import OUTLINE_SIDE, outline_sigma, with_outlines
 from calibration.flashlight.tone_curve import WORST_STEPS, compare_curves
 from calibration.flashlight.uncertainty import position_sigma, unseen_error
-from calibration.ground.table_edges import on_table
 from calibration.light import Light, Vector
 from calibration.lights.ground_cells import ground_ends
 from calibration.lights.power import albedo_scale
@@ -233,7 +233,7 @@ def locate_lights(
     """
     evidence, photos = collect(stack, posed_camera, usable)
     edges = ground_ends(stack, posed_camera, usable)
-    evidence = replace(evidence, weight=evidence.weight * on_table(edges, evidence.cells.points))
+    evidence = before_ends(evidence, edges)
     fit = without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent))
     fit = with_oval_beams(refit_outliers(fit), evidence)
     names = [stack.paths[k].name for k in photos]

@@ -11,6 +11,7 @@ from calibration.board.corners import Corners
 from calibration.board.intrinsics import CameraFit, fit_camera
 from calibration.flashlight.fit import (
     FlashlightFit,
+    before_ends,
     collect,
     first_guess,
     fit_flashlights,
@@ -22,7 +23,6 @@ from calibration.flashlight.light_estimate import LightFit, describe
 from calibration.flashlight.model import Flashlights, free_tangent
 from calibration.flashlight.tone_curve import WORST_STEPS, compare_curves
 from calibration.flashlight.uncertainty import position_sigma, unseen_error
-from calibration.ground.table_edges import on_table
 from calibration.lights.ground_cells import ground_ends
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
@@ -83,8 +83,7 @@ def locate_lights_from_phone(
         CalibrationError: fewer than 4 phone photos show the board, or as locate_lights raises.
     """
     evidence, photos = collect(stack, posed_camera, usable)
-    edges = ground_ends(stack, posed_camera, usable)
-    evidence = replace(evidence, weight=evidence.weight * on_table(edges, evidence.cells.points))
+    evidence = before_ends(evidence, ground_ends(stack, posed_camera, usable))
     lens, poses = _poses(views)
     alone = refit_outliers(without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent)))
     poses = _least_turned(poses, views, alone.flashlights)
@@ -128,7 +127,7 @@ def _fit(
     """
     known = None if views.led_offset_mm is None else np.array(views.led_offset_mm)
     fit, error = _fit_offset(carried, alone, known), OFFSET_ERROR_MM[0 if known is None else 1]
-    if known is None and not _is_beside(_led_offset(fit, carried)):  # the shading misleads: better none than this
+    if known is None and not led_is_beside(_led_offset(fit, carried)):  # the shading misleads: better none than this
         fit, error = _fit_offset(carried, alone, np.zeros(3)), UNKNOWN_OFFSET_MM
     if views.back is None or known is not None:
         return fit, error, None
@@ -152,7 +151,7 @@ def _led_offset(fit: FlashlightFit, carried: _Carried) -> Float[np.ndarray, "3"]
     return pose.inverse().apply(fit.flashlights.positions[k])
 
 
-def _is_beside(offset: Float[np.ndarray, "3"]) -> bool:
+def led_is_beside(offset: Float[np.ndarray, "3"]) -> bool:
     """Return whether an LED may lie there: beside its lens, on the same back."""
     return bool(np.linalg.norm(offset) < FARTHEST_LED_MM and abs(offset[2]) < DEEPEST_LED_MM)
 
