@@ -146,21 +146,21 @@ def _steps(level: np.ndarray, angle: float, offset: float, reach: int) -> tuple[
     to_picture = np.column_stack([along, normal, middle - along * (length - 1) / 2 + normal * (offset - reach)])
     size, how = (length, 2 * reach + 1), cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
     rows = np.stack([cv2.warpAffine(one, to_picture, size, flags=how, borderValue=np.nan) for one in level])
-    strip = sum(rows[:, k : rows.shape[1] - STRIP + 1 + k] for k in range(STRIP)) / STRIP
+    strip = np.mean([rows[:, k : rows.shape[1] - STRIP + 1 + k] for k in range(STRIP)], axis=0)
     apart = STRIP + GAP
     step = strip[:, apart:] - strip[:, :-apart]
     step = step[:, apart:-apart] - (step[:, : -2 * apart] + step[:, 2 * apart :]) / 2
     long_enough = np.isfinite(step).sum(2) > LEAST_LENGTH * width
-    typical = np.stack([_median(step[:, :, part], 2) for part in _parts(np.isfinite(step).any((0, 1)))])
+    typical = np.stack([_median(step[:, :, part], 2) for part in _parts(np.isfinite(step))])
     spread = np.nan_to_num(1.4826 * _median(np.abs(typical - _median(typical, 1)[:, None]), 1)).min(0)
     spread[long_enough.sum(0) < max(FEWEST_PHOTOS, n / 2)] = 0
     best = int(np.argmax(spread))
     return float(spread[best]), offset - reach + best + apart + STRIP + (GAP - 1) / 2
 
 
-def _parts(known: Bool[np.ndarray, " columns"]) -> list[slice]:
+def _parts(known: Bool[np.ndarray, "photos rows columns"]) -> list[slice]:
     """Divide the columns from the first known one to the last into parts of one length."""
-    ends = np.flatnonzero(known)
+    ends = np.flatnonzero(np.any(known, axis=(0, 1)))
     cuts = np.linspace(ends[0], ends[-1] + 1, PARTS + 1).astype(int) if len(ends) else np.zeros(PARTS + 1, int)
     return [slice(low, max(high, low + 1)) for low, high in pairwise(cuts)]
 
