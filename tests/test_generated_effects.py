@@ -276,6 +276,8 @@ def test_a_table_ends_at_its_edge_and_a_floor_lies_below():
     floor, table = ~seen.is_table & ~seen.mask, seen.is_table
     assert floor.mean() > 0.05 and np.allclose(seen.points[floor][:, 2], -poses.FLOOR_MM)
     assert (seen.points[table] @ edge.normal).min() >= edge.offset
+    turned = poses.edge_of(Setup(table=Table(edge=100.0, edge_turn=30.0), phone=setup.phone), thing)
+    assert turned is not None and turned.normal @ edge.normal == pytest.approx(np.cos(np.radians(30)))
     shapes = stage(setup, BOARD, thing, fixed.camera, np.random.default_rng(0)).shapes
     top, below = shapes["table"].bbox(), shapes["floor"].bbox()
     assert top.max[1] == pytest.approx(-edge.offset) and np.allclose(edge.normal, [0, -1, 0])

@@ -10,7 +10,15 @@ from calibration.board.board import Board
 from calibration.board.corners import Corners
 from calibration.camera import Camera
 from calibration.flashlight.led_offset import BackView, LensReading
-from calibration.flashlight.phone import PhoneViews, locate_lights_from_phone
+from calibration.flashlight.model import Flashlights
+from calibration.flashlight.phone import (
+    PhoneViews,
+    led_is_beside,
+    locate_lights_from_phone,
+    pair_in_order,
+    pair_in_step,
+)
+from calibration.pose import Pose
 from capture.errors import CalibrationError
 
 LENS = Camera(1000, 750, 740.0, 740.0, 507.0, 381.0, (-0.04, 0.03, 0.0, 0.0, 0.0))
@@ -109,3 +117,36 @@ def test_three_views_of_the_board_are_too_few(scene):
     truth, detections = scene
     with pytest.raises(CalibrationError, match=r"found in 3 of 10 photos .* 4 needed"):
         locate(truth, [*detections[:3], *[None] * 7])
+
+
+def _handheld(count: int) -> tuple[Flashlights, list[Pose | None]]:
+    """Phones around a table, and flashlights where shading misplaces them by a third of their range and more."""
+    rng = np.random.default_rng(0)
+    angle = rng.permutation(count) * 2 * np.pi / count
+    places = 600 * np.column_stack([0.8 * np.cos(angle), 0.8 * np.sin(angle), np.full(count, 0.6)])
+    off = places + rng.normal(0, 150, places.shape)
+    flashlights = Flashlights(off, np.zeros_like(off), np.zeros(count), np.ones(1), 0.0, np.zeros(3))
+    return flashlights, [Pose(np.eye(3), place) for place in places]
+
+
+def test_where_shading_is_far_off_phone_photos_are_paired_by_their_numbers():
+    flashlights, poses = _handheld(20)
+    photos, nothing = np.arange(20), np.full(20, -1)
+    assert (pair_in_order(poses, flashlights, np.zeros(3), photos) >= 0).sum() < 13
+    np.testing.assert_array_equal(pair_in_step(poses, flashlights, np.zeros(3), photos, nothing), photos)
+    poses[3] = None
+    assert pair_in_step(poses, flashlights, np.zeros(3), photos, nothing)[3] == -1
+
+
+def test_phone_photos_that_are_out_of_step_are_not_paired_by_their_numbers():
+    flashlights, poses = _handheld(20)
+    photos, nothing = np.arange(20), np.full(20, -1)
+    late = [*poses[1:], None]
+    np.testing.assert_array_equal(pair_in_step(late, flashlights, np.zeros(3), photos, nothing), nothing)
+
+
+@pytest.mark.parametrize(
+    ("offset", "may_be"), [((-14, 6, 0), True), ((25, -20, 8), True), ((-45, -55, 2), False), ((10, 5, -150), False)]
+)
+def test_an_led_lies_on_the_phones_back_not_far_from_its_lens(offset, may_be):
+    assert led_is_beside(np.array(offset, float)) == may_be

@@ -1,40 +1,108 @@
-"""Where the table ends, from how well points of the ground follow the lights."""
+"""Where the ground ends: lines along which the light of the photos jumps, in pictures made of one plane or two."""
 
 import numpy as np
 import pytest
 
-from calibration.ground.table_edges import find_table_edges
+from calibration.ground.ground_field import at_photo_size, fit_ground_field
+from calibration.ground.ground_shadows import GROUND_LIKE, find_shadows
+from calibration.ground.table_edges import find_table_edges, on_table, seen_beyond
 
 EYE = np.array([0.0, -500.0, 400.0])
+HEIGHT, WIDTH, PHOTOS = 96, 128, 12
+BALL, RADIUS = np.array([0.0, 0.0, 30.0]), 30.0
 
 
-def points(rng) -> np.ndarray:
-    return np.column_stack([rng.uniform(-400, 400, 3000), rng.uniform(-300, 600, 3000), np.zeros(3000)])
+def table_points() -> np.ndarray:
+    """The ground in each pixel of a camera that looks from EYE at the origin."""
+    forward = -EYE / np.linalg.norm(EYE)
+    right = np.array([1.0, 0.0, 0.0])
+    down = np.cross(forward, right)
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    rays = forward + ((u - WIDTH / 2)[..., None] * right + (v - HEIGHT / 2)[..., None] * down) / (1.1 * WIDTH)
+    away = np.where(rays[..., 2] < -0.01, -EYE[2] / np.minimum(rays[..., 2], -0.01), np.nan)
+    return EYE + away[..., None] * rays
 
 
-@pytest.mark.parametrize("angle", [90.0, 60.0, 135.0])
-def test_a_line_beyond_which_nothing_follows_is_the_tables_edge(angle):
-    rng = np.random.default_rng(0)
-    places, normal = points(rng), -np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
-    beyond = places[:, :2] @ normal < -150
-    follows = np.where(beyond, 0.4, 0.9) + rng.normal(0, 0.15, 3000)
-    (edge,) = find_table_edges(places, follows, EYE)
-    assert edge.normal @ normal > np.cos(np.radians(3)) and abs(edge.offset + 150) < 25
-    assert (edge.on_table(places) == ~beyond).mean() > 0.97 and edge.on_table(np.zeros((1, 3))).all()
+def photos(points: np.ndarray, inside: np.ndarray, drop: float, rng: np.random.Generator) -> np.ndarray:
+    """A table whose points outside lie `drop` lower along their rays, a ball with its shadow, and noise."""
+    lower = EYE + (points - EYE) * ((EYE[2] + drop) / EYE[2])
+    seen = np.where(inside[..., None], points, lower)
+    albedo = np.where(inside, 0.5, 0.3) * np.exp(0.1 * rng.standard_normal(inside.shape))
+    rays = points - EYE
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    ball = hits(np.broadcast_to(EYE, points.shape), rays)
+    pictures = []
+    for turn in np.linspace(0, 2 * np.pi, PHOTOS, endpoint=False):
+        light = np.array([350 * np.cos(turn), 250 * np.sin(turn), 350 + 100 * np.cos(3 * turn)])
+        way = light - seen
+        away = np.linalg.norm(way, axis=-1, keepdims=True)
+        shade = 3e4 * way[..., 2] / away[..., 0] ** 3 * np.where(inside & hits(seen, way / away), 0.05, 1.0)
+        grey = np.where(ball, 0.15 + 0.1 * np.sin(turn + points[..., 0] / 15), albedo * shade * 8)
+        pictures.append(grey * np.exp(0.01 * rng.standard_normal(grey.shape)))
+    return np.repeat(np.nan_to_num(np.stack(pictures), nan=1e-4)[..., None], 3, -1).astype(np.float32)
 
 
-def test_a_corner_of_the_table_has_two_edges():
-    rng = np.random.default_rng(1)
-    places = points(rng)
-    beyond = (places[:, 1] > 200) | (places[:, 0] > 150)
-    edges = find_table_edges(places, np.where(beyond, 0.3, 0.9) + rng.normal(0, 0.1, 3000), EYE)
-    on_table = np.all([edge.on_table(places) for edge in edges], axis=0)
-    assert len(edges) == 2 and (on_table == ~beyond).mean() > 0.96
+def hits(start: np.ndarray, along: np.ndarray) -> np.ndarray:
+    to_ball = BALL - start
+    reach = (to_ball * along).sum(-1)
+    return (reach > 0) & ((to_ball**2).sum(-1) - reach**2 < RADIUS**2)
 
 
-def test_shadows_around_an_object_and_a_table_without_end_have_no_edge():
-    rng = np.random.default_rng(2)
-    places = points(rng)
-    follows = 0.95 - 0.6 * np.exp(-((np.linalg.norm(places, axis=1) / 120) ** 2)) + rng.normal(0, 0.05, 3000)
-    assert not find_table_edges(places, follows, EYE)
-    assert not find_table_edges(places, np.full(3000, 0.9), EYE)
+def outside(points: np.ndarray, angle: float, offset: float) -> np.ndarray:
+    normal = -np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
+    return ~(points[..., :2] @ normal > -offset)
+
+
+def everywhere(rgb: np.ndarray) -> np.ndarray:
+    return np.ones(rgb.shape[:3], bool)
+
+
+@pytest.mark.parametrize("angle", [90.0, 65.0, 120.0])
+def test_the_line_along_which_the_light_jumps_is_the_tables_edge(angle):
+    points, rng = table_points(), np.random.default_rng(0)
+    beyond = outside(points, angle, 110.0)
+    rgb = photos(points, ~beyond, 700.0, rng)
+    (edge,) = find_table_edges(rgb, everywhere(rgb), points, EYE)
+    normal = -np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
+    assert edge.normal @ normal > np.cos(np.radians(3)) and abs(edge.offset + 110) < 10
+    assert (edge.on_table(points) == ~beyond).mean() > 0.98 and edge.on_table(np.zeros((1, 3))).all()
+
+
+def test_shadows_stains_and_a_ball_on_a_table_without_end_are_no_edge():
+    points, rng = table_points(), np.random.default_rng(2)
+    rgb = photos(points, np.isfinite(points[..., 0]), 0.0, rng)
+    rgb[:, :, : WIDTH // 3] *= 0.4  # a cloth: an edge of albedo, the same in all photos
+    assert not find_table_edges(rgb, everywhere(rgb), points, EYE)
+    assert seen_beyond(rgb, everywhere(rgb), points, EYE) is None
+
+
+def test_an_exposure_that_changes_from_photo_to_photo_is_no_edge_and_hides_none():
+    points, rng = table_points(), np.random.default_rng(3)
+    gains = np.exp(rng.normal(0, 0.5, (PHOTOS, 1, 1, 1))).astype(np.float32)
+    whole = photos(points, np.isfinite(points[..., 0]), 0.0, rng) * gains
+    assert not find_table_edges(whole, everywhere(whole), points, EYE)
+    ends = photos(points, ~outside(points, 90.0, 110.0), 700.0, rng) * gains
+    assert len(find_table_edges(ends, everywhere(ends), points, EYE)) == 1
+
+
+def test_no_ground_and_no_shadow_is_seen_beyond_the_edge_and_the_object_before_it_is_whole():
+    points, rng = table_points(), np.random.default_rng(4)
+    beyond = outside(points, 90.0, 60.0)
+    rgb = photos(points, ~beyond, 700.0, rng)
+    found = seen_beyond(rgb, everywhere(rgb), points, EYE)
+    assert found is not None and (found == beyond).mean() > 0.98
+    field = at_photo_size(fit_ground_field(rgb, everywhere(rgb), found), rgb, everywhere(rgb))
+    shadows = find_shadows(field)
+    rays = points - EYE
+    ball = hits(np.broadcast_to(EYE, points.shape), rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+    assert (ball & beyond).sum() > 30, "the ball is seen before the floor"
+    assert (shadows.object_mask & ball).sum() / (shadows.object_mask | ball).sum() > 0.85
+    assert not (shadows.likelihood < GROUND_LIKE)[beyond & (np.roll(beyond, -3, 0))].any()
+
+
+def test_a_point_above_the_horizon_is_on_no_table():
+    points = table_points()
+    beyond = outside(points, 90.0, 110.0)
+    rgb = photos(points, ~beyond, 700.0, np.random.default_rng(5))
+    edges = find_table_edges(rgb, everywhere(rgb), points, EYE)
+    assert not on_table(edges, np.full((1, 3), np.nan)).any() and on_table((), points).all()

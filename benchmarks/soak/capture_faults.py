@@ -16,6 +16,8 @@ ELECTRONS = 10_000.0  # that fill a pixel: noise of what has to be invented
 EXIF_IFD, ISO = 0x8769, 34855
 FEWEST_LEFT = 4  # photos that show the board's view, in a capture that goes on with them
 SKIN = np.array([0.42, 0.25, 0.18], np.float32)
+CLOTH = np.array([0.04, 0.045, 0.06], np.float32)  # a dark sleeve
+GLARE_PX = 60  # sigma of a flashlight's halo
 TILT = 0.2  # room light: from the middle of the picture to its border
 ROLL = 0.3  # of a bump's shift, at the sides of the picture
 REFERENCE_PX = 1024  # long side of the photos for which lengths in px are stated
@@ -251,31 +253,40 @@ def _shaken(case: Case, source: Original, rng: np.random.Generator) -> Case:
     return replace(case, size="8 to 30 px", words="blurred", bad=_one(rng), altered=alter)
 
 
-def _hand(case: Case, source: Original, rng: np.random.Generator) -> Case:
-    """An arm that reaches into the picture, lit by the flashlight, with its shadow on the table beside it."""
-    height, width = source.usual.shape[:2]
-    way = rng.uniform(0, 2 * np.pi)
-    middle = np.array([width, height]) * rng.uniform(0.3, 0.7, 2)
-    outside = middle + 2 * width * np.array([np.cos(way), np.sin(way)])
-    thick = int(rng.uniform(0.08, 0.2) * width)
-    bad = _one(rng)
+def _hand(albedo: np.ndarray, has_lamp: bool = False) -> Callable[..., Case]:
+    """An arm that reaches into the picture, lit by the flashlight, with its shadow on the table beside it.
 
-    def drawn_line(shift: np.ndarray) -> np.ndarray:
-        ends = [tuple(int(x) for x in end + shift) for end in (middle, outside)]
-        mask = cv2.line(np.zeros((height, width), np.float32), ends[0], ends[1], 1.0, thick)
-        return cv2.GaussianBlur(mask, (0, 0), 2.0)[..., None]
+    With a lamp: its end, as bright as can be, with a halo.
+    """
 
-    arm, shadow = drawn_line(np.zeros(2)), drawn_line(rng.uniform(-1, 1, 2) * thick)
-    round_off = cv2.GaussianBlur(arm, (0, 0), thick / 4)[..., None]
-    level = float(np.median(source.usual.mean(2))) / 0.4  # light that makes a table of albedo 0.4 so bright
-    mottled = 1 + 0.03 * cv2.GaussianBlur(rng.standard_normal((height, width, 1)), (0, 0), 3)[..., None]
-    skin = (level * rng.uniform(0.5, 1.5) * SKIN * round_off**2 * mottled).astype(np.float32)
+    def drawn(case: Case, source: Original, rng: np.random.Generator) -> Case:
+        height, width = source.usual.shape[:2]
+        way = rng.uniform(0, 2 * np.pi)
+        middle = np.array([width, height]) * rng.uniform(0.3, 0.7, 2)
+        outside = middle + 2 * width * np.array([np.cos(way), np.sin(way)])
+        thick = int(rng.uniform(0.08, 0.2) * width)
+        bad = _one(rng)
 
-    def alter(place: int) -> Pixels:
-        table = source.pixels(case.chosen[place]) * (1 - 0.9 * shadow)
-        return np.clip(table * (1 - arm) + skin * arm, 0, 1)
+        def drawn_line(shift: np.ndarray) -> np.ndarray:
+            ends = [tuple(int(x) for x in end + shift) for end in (middle, outside)]
+            mask = cv2.line(np.zeros((height, width), np.float32), ends[0], ends[1], 1.0, thick)
+            return cv2.GaussianBlur(mask, (0, 0), 2.0)[..., None]
 
-    return replace(case, words="covered", bad=bad, altered=alter)
+        arm, shadow = drawn_line(np.zeros(2)), drawn_line(rng.uniform(-1, 1, 2) * thick)
+        round_off = cv2.GaussianBlur(arm, (0, 0), thick / 4)[..., None]
+        level = float(np.median(source.usual.mean(2))) / 0.4  # light that makes a table of albedo 0.4 so bright
+        mottled = 1 + 0.03 * cv2.GaussianBlur(rng.standard_normal((height, width, 1)), (0, 0), 3)[..., None]
+        skin = (level * rng.uniform(0.5, 1.5) * albedo * round_off**2 * mottled).astype(np.float32)
+        lamp = cv2.circle(np.zeros((height, width), np.float32), tuple(middle.astype(int)), thick // 4, 10.0, -1)
+        glare = (has_lamp * (lamp + cv2.GaussianBlur(lamp, (0, 0), source.px(GLARE_PX))))[..., None]
+
+        def alter(place: int) -> Pixels:
+            table = source.pixels(case.chosen[place]) * (1 - 0.9 * shadow)
+            return np.clip(table * (1 - arm) + skin * arm + glare, 0, 1)
+
+        return replace(case, words="covered", bad=bad, altered=alter)
+
+    return drawn
 
 
 MOVED = "registered|camera moved"  # moved back and used, or left out
@@ -293,7 +304,9 @@ FAMILIES: dict[str, Callable[[Case, Original, np.random.Generator], Case]] = {
     "a copy": _copy,
     "out of focus": _out_of_focus,
     "shaken": _shaken,
-    "a hand in the picture": _hand,
+    "a hand in the picture": _hand(SKIN),
+    "a sleeve in the picture": _hand(CLOTH),
+    "the flashlight in the picture": _hand(SKIN, has_lamp=True),
     **{f"camera moved by {px} px, before most photos": _moved(px, True, _most) for px in (3, 10)},
     "camera moved by 10 px, after the board's photo": _moved(10, False, _most),
 }

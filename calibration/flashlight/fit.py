@@ -1,5 +1,6 @@
 """Fit the flashlight of every photo: a coarse search, then a robust fit that handles gloss and stray photos."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from calibration.flashlight.model import (
     log_irradiance,
     refine,
 )
-from calibration.ground.table_edges import find_table_edges, on_table
+from calibration.ground.table_edges import TableEdge, on_table
 from calibration.lights.ground_cells import GroundCells, sample_ground
 from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
@@ -39,8 +40,6 @@ START_BEAM = 2.0  # cos^2: between a bare LED and a focused one
 REFIT_RESIDUAL = 2.0  # of the median photo: such a photo may sit in a wrong minimum
 GLOSS_ANGLE = np.radians(22.0)  # half angle below which a glossy table mirrors the light
 GLOSS_RISE = 0.03
-FOLLOWS = 0.03  # log units: samples nearer than this follow the model, ...
-FOLLOWS_QUARTILES = 2.5  # ... or nearer than this many lower quartiles over the cells
 OVAL_GAIN = 0.85  # of the residual: round beams keep 0.98, beams with 2 % of asymmetry at 40 degrees go to 0.5
 OVAL_PHOTOS = 8  # fewer leave the ground's albedo free enough to take the terms up
 
@@ -81,6 +80,12 @@ def collect(
     evidence = Evidence.of(cells, np.array(stack.gains)[photos], posed_camera.ground_height)
     refuse_still_light(evidence)
     return evidence, photos
+
+
+def before_ends(evidence: Evidence, edges: Sequence[TableEdge]) -> Evidence:
+    """Return the evidence without the cells beyond the ground's ends; as it is where too few would be left."""
+    inside = on_table(edges, evidence.cells.points)
+    return replace(evidence, weight=evidence.weight * inside) if inside.sum() >= MIN_GROUND else evidence
 
 
 def hemisphere(cells: GroundCells) -> list[Float[np.ndarray, "candidates 3"]]:
@@ -267,16 +272,6 @@ def with_oval_beams(fit: FlashlightFit, evidence: Evidence) -> FlashlightFit:
     afresh = replace(evidence, weight=np.where(fit.evidence.weight > 0, evidence.weight, 0.0))
     beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS)]
     return fit_flashlights(replace(fit.flashlights, beam=beam, oval=np.zeros((n, 2))), afresh, fit.tangent)
-
-
-def cells_on_table(fit: FlashlightFit) -> Bool[np.ndarray, " cells"]:
-    """Return the cells before the table's edges; all of them where no edge is seen, or too few would be left."""
-    cells, known = fit.evidence.cells, fit.evidence.weight > 0
-    size, seen = np.where(known, np.abs(fit.residual()), np.nan), known.any(0)
-    near = max(FOLLOWS, FOLLOWS_QUARTILES * float(np.quantile(np.nanmedian(size[:, seen], axis=0), 0.25)))
-    follows = (size[:, seen] < near).sum(0) / known[:, seen].sum(0)
-    inside = on_table(find_table_edges(cells.points[seen], follows, cells.eye), cells.points)
-    return inside if (inside & seen).sum() >= MIN_GROUND else np.ones_like(inside)
 
 
 def photo_quality(fit: FlashlightFit):

@@ -11,7 +11,7 @@ from calibration.flashlight.duplicates import earlier_duplicate
 from calibration.flashlight.fit import (
     LAST,
     FlashlightFit,
-    cells_on_table,
+    before_ends,
     collect,
     first_guess,
     fit_flashlights,
@@ -33,6 +33,7 @@ from calibration.flashlight.outline_lights import OUTLINE_SIDE, outline_sigma, w
 from calibration.flashlight.tone_curve import WORST_STEPS, compare_curves
 from calibration.flashlight.uncertainty import position_sigma, unseen_error
 from calibration.light import Light, Vector
+from calibration.lights.ground_cells import ground_ends
 from calibration.lights.power import albedo_scale
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
 from calibration.outlines.terms import DROP_OUTLINE
@@ -231,7 +232,7 @@ def locate_lights(
 
     Only camera and ground are known. Steps: mean colour of ground cells, a search over a hemisphere of flashlight
     places, then a robust fit of all flashlights together. The object and its shadows are rejected as outliers, and what
-    lies beyond the table's edge is left out. Where that places too few lights, outlines of shadows and shading are
+    lies beyond the ground's end is left out. Where that places too few lights, outlines of shadows and shading are
     fitted together.
 
     Args:
@@ -244,12 +245,9 @@ def locate_lights(
         CalibrationError: fewer than 4 photos or lights, or too little bare ground in view.
     """
     evidence, photos = collect(stack, posed_camera, usable)
-    fit = fit_flashlights(first_guess(evidence), evidence, free_tangent)
-    on_table = cells_on_table(fit)
-    if not on_table.all():
-        evidence = replace(evidence, weight=evidence.weight * on_table)
-        fit = fit_flashlights(first_guess(evidence), evidence, free_tangent)
-    fit = without_gloss(fit)
+    edges = ground_ends(stack, posed_camera, usable)
+    evidence = before_ends(evidence, edges)
+    fit = without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent))
     fit = with_oval_beams(refit_outliers(fit), evidence)
     names = [stack.paths[k].name for k in photos]
     tone = compare_curves(fit, np.array(stack.gains)[photos], stack.is_linear)
@@ -259,7 +257,7 @@ def locate_lights(
     joint = (
         None
         if surely_placed(found, evidence.cells.centre) >= FEWEST_USED
-        else with_outlines(evidence, stack, posed_camera, usable, fit.flashlights.positions, cues)
+        else with_outlines(evidence, stack, posed_camera, usable, fit.flashlights.positions, edges, cues)
     )
     if joint is None:
         return found

@@ -6,6 +6,7 @@ the shading of all photos together decides them (common_motion). Both are fitted
 shading trusted only as far as its own misfit allows. Photos whose shadows the picture cuts are located last.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from operator import itemgetter
 
@@ -32,6 +33,8 @@ from calibration.flashlight.model import (
 from calibration.ground.ground_field import at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows, find_shadows, of_one_ground
 from calibration.ground.mirror_highlights import find_highlights
+from calibration.ground.table_edges import TableEdge
+from calibration.lights.ground_cells import beyond_ends
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
 from calibration.outlines.outline_maps import near_ground, outline_maps, with_cues
 from calibration.outlines.relocate import likely_places
@@ -58,6 +61,7 @@ def with_outlines(
     posed_camera: PosedCamera,
     photos: Bool[np.ndarray, " photos"],
     by_shading: Float[np.ndarray, "photos 3"],
+    edges: Sequence[TableEdge] = (),
     cues: MetricCues = NO_CUES,
 ) -> FlashlightFit | None:
     """Return the joint fit, world frame; None without an object, enough shadows, or ground that follows.
@@ -66,10 +70,11 @@ def with_outlines(
         evidence: of the used photos, before any fit.
         photos: which of the stack these are.
         by_shading: positions, world, that shading alone gives; some may be far off.
+        edges: where the ground ends, world: no shadow beyond them is looked at.
         cues: photos from the side, a height: they fix the numbers that outlines leave free.
     """
     rgb, usable = stack.rgb[photos], ~stack.clipped[photos]
-    coarse = fit_ground_field(rgb, usable)
+    coarse = fit_ground_field(rgb, usable, beyond_ends(edges, posed_camera, rgb.shape[1:3]))
     field = at_photo_size(coarse, rgb, usable, OUTLINE_SIDE)
     shadows = of_one_ground(find_shadows(field))
     maps = outline_maps(field, shadows, posed_camera)

@@ -11,6 +11,7 @@ from calibration.board.corners import Corners
 from calibration.board.intrinsics import CameraFit, fit_camera
 from calibration.flashlight.fit import (
     FlashlightFit,
+    before_ends,
     collect,
     first_guess,
     fit_flashlights,
@@ -22,6 +23,7 @@ from calibration.flashlight.light_estimate import LightFit, describe
 from calibration.flashlight.model import Flashlights, free_tangent
 from calibration.flashlight.tone_curve import WORST_STEPS, compare_curves
 from calibration.flashlight.uncertainty import position_sigma, unseen_error
+from calibration.lights.ground_cells import ground_ends
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
@@ -31,7 +33,12 @@ MIN_VIEWS = 4  # photos of the board that the phone's lens and the LED's place b
 WORST_RMS = 0.002  # of the photo's longer side: corners in wrong places
 PAIR_LIMIT = 0.25  # of the range: farther apart, a phone photo and a lit photo were not taken together
 PAIR_SKIP = 0.2  # what leaving a phone photo or a lit photo alone costs: less than a wrong pair, more than a fair one
+FEWEST_PAIRED = 2 / 3  # of the lit photos: fewer pairs mean that shading is far off, as with a phone's picture pipeline
+SHIFTS = 3  # numbers by which phone photos and lit photos may be out of step
+IN_STEP = 0.85  # of the distance to phones that are out of step
 OFFSET_ERROR_MM = (2.0, 1.0)  # of the LED's place beside the lens, fitted (1 to 6 mm in simulations) and given
+FARTHEST_LED_MM, DEEPEST_LED_MM = 50.0, 15.0  # from its lens, and along the lens's axis; a fit errs by up to 6 mm
+UNKNOWN_OFFSET_MM = 18.0  # the LED's usual distance from its lens, where neither shading nor the owner tells it
 QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -76,10 +83,13 @@ def locate_lights_from_phone(
         CalibrationError: fewer than 4 phone photos show the board, or as locate_lights raises.
     """
     evidence, photos = collect(stack, posed_camera, usable)
+    evidence = before_ends(evidence, ground_ends(stack, posed_camera, usable))
     lens, poses = _poses(views)
     alone = refit_outliers(without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent)))
     poses = _least_turned(poses, views, alone.flashlights)
     partner = pair_in_order(poses, alone.flashlights, evidence.cells.centre, photos)
+    if len(poses) == len(usable) and (partner >= 0).sum() < FEWEST_PAIRED * len(photos):
+        partner = pair_in_step(poses, alone.flashlights, evidence.cells.centre, photos, partner)
     carried = _carry([poses[p] if p >= 0 else None for p in partner], alone)
     if carried.posed().sum() < MIN_VIEWS:
         raise _too_few(int(carried.posed().sum()), views)
@@ -116,12 +126,14 @@ def _fit(
     phone's orientation.
     """
     known = None if views.led_offset_mm is None else np.array(views.led_offset_mm)
-    fit = _fit_offset(carried, alone, known)
+    fit, error = _fit_offset(carried, alone, known), OFFSET_ERROR_MM[0 if known is None else 1]
+    if known is None and not led_is_beside(_led_offset(fit, carried)):  # the shading misleads: better none than this
+        fit, error = _fit_offset(carried, alone, np.zeros(3)), UNKNOWN_OFFSET_MM
     if views.back is None or known is not None:
-        return fit, OFFSET_ERROR_MM[0 if known is None else 1], None
+        return fit, error, None
     choice = choose(views.back, _led_offset(fit, carried), lens_error_mm)
     if choice.offset_mm is None:
-        return fit, OFFSET_ERROR_MM[0], choice
+        return fit, error, choice
     return _fit_offset(carried, alone, np.array(choice.offset_mm)), choice.sigma_mm, choice
 
 
@@ -137,6 +149,11 @@ def _led_offset(fit: FlashlightFit, carried: _Carried) -> Float[np.ndarray, "3"]
     pose = carried.poses[k]
     assert pose is not None
     return pose.inverse().apply(fit.flashlights.positions[k])
+
+
+def led_is_beside(offset: Float[np.ndarray, "3"]) -> bool:
+    """Return whether an LED may lie there: beside its lens, on the same back."""
+    return bool(np.linalg.norm(offset) < FARTHEST_LED_MM and abs(offset[2]) < DEEPEST_LED_MM)
 
 
 def _phone_back(back: BackView | None, choice: Choice | None) -> dict[str, Any]:
@@ -221,6 +238,32 @@ def pair_in_order(
             i, j = i - 1, j - 1
             partner[i] = j if price[i, j] < PAIR_LIMIT else -1
     return partner
+
+
+def pair_in_step(
+    poses: list[Pose | None],
+    flashlights: Flashlights,
+    centre: Float[np.ndarray, "3"],
+    photos: Int[np.ndarray, " used"],
+    otherwise: Int[np.ndarray, " used"],
+) -> Int[np.ndarray, " used"]:
+    """Return the phone photo of the same number for every lit photo, where shading is too far off to tell each pair.
+
+    Shading must place the flashlights clearly nearer to these phones than to those some numbers before or after; else
+    `otherwise` is returned.
+    """
+    places = np.array([np.full(3, np.nan) if pose is None else pose.translation for pose in poses])
+    reach = np.linalg.norm(flashlights.positions - centre, axis=1)
+
+    def price(shift: int) -> float:
+        other = photos + shift
+        inside = (other >= 0) & (other < len(poses))
+        away = np.linalg.norm(flashlights.positions[inside] - places[other[inside]], axis=1) / reach[inside]
+        return float(np.nanmean(np.minimum(away, 1.0))) if np.isfinite(away).any() else 1.0
+
+    apart = min(price(shift) for shift in range(-SHIFTS, SHIFTS + 1) if shift)
+    seen = np.array([poses[k] is not None for k in photos])
+    return np.where(seen, photos, -1) if price(0) < IN_STEP * apart else otherwise
 
 
 def _carry(poses: list[Pose | None], alone: FlashlightFit) -> _Carried:

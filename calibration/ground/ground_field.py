@@ -4,10 +4,10 @@
 
 a is the log albedo of pixel x, S_k the log irradiance in photo k times whatever the phone did to its brightness, e_k
 the residual: about 0 on lit ground, far below 0 in shadow, anything on the object. No light, beam, exposure or tone
-curve is assumed; S_k only has to be smooth: a quartic polynomial of the picture, then a normalized convolution of the
-residual [Knutsson and Westin 1993] from coarse to fine. Both are fitted in turn with the albedo, by iteratively
-reweighted least squares [Holland and Welsch 1977]: darker samples lose their weight sooner than brighter ones, since
-shadows are dark.
+curve is assumed; S_k only has to be smooth, before the ground's end and beyond it (table_edges): a quartic polynomial
+of the picture, then a normalized convolution of the residual [Knutsson and Westin 1993] from coarse to fine. Both are
+fitted in turn with the albedo, by iteratively reweighted least squares [Holland and Welsch 1977]: darker samples lose
+their weight sooner than brighter ones, since shadows are dark.
 """
 
 from dataclasses import dataclass
@@ -43,23 +43,45 @@ class GroundField:
     residual: Maps  # e_k
     usable: Bool[np.ndarray, "photos height width"]  # neither clipped nor too dark
     follows: Float[np.ndarray, "height width"]  # share of the photos in which the pixel follows the field
+    beyond: Bool[np.ndarray, "height width"] | None = None  # what is seen beyond the ground's end; None: it has none
 
-    def noise(self) -> float:
-        """Return one sigma of lit ground, log units, as measured on pixels that follow the field in most photos."""
-        near = self.usable & (self.follows > 0.5) & (np.abs(self.residual) < SCALES[0])
-        return spread(self.residual[near])
+    def noise(self, of_beyond: bool = False) -> float:
+        """Return one sigma of lit ground, log units, as measured on pixels that follow the field in most photos.
+
+        Args:
+            of_beyond: what is seen beyond the ground's end instead; 0 where nothing of it follows.
+        """
+        there = np.zeros(self.follows.shape, bool) if self.beyond is None else self.beyond
+        side = there if of_beyond else ~there
+        near = self.usable & side & (self.follows > 0.5) & (np.abs(self.residual) < SCALES[0])
+        return spread(self.residual[near]) if near.any() else 0.0
 
 
 def fit_ground_field(
-    rgb: Float[np.ndarray, "photos height width 3"], usable: Bool[np.ndarray, "photos height width"]
+    rgb: Float[np.ndarray, "photos height width 3"],
+    usable: Bool[np.ndarray, "photos height width"],
+    beyond: Bool[np.ndarray, "height width"] | None = None,
 ) -> GroundField:
     """Fit the field to linear photos of one fixed camera, relative exposure divided out.
 
     Args:
         usable: False where a sample is clipped or unknown.
+        beyond: what is seen beyond the ground's end: it gets a field of its own; None where the ground has no end.
     """
     grey, usable = reduced(rgb, usable)
     usable &= grey > DARKEST
+    if beyond is None:
+        return _one_field(grey, usable)
+    there = enlarged(beyond[None].astype(np.float32), *grey.shape[1:])[0] > 0.5
+    near, far = _one_field(grey, usable & ~there), _one_field(grey, usable & there)
+    parts = {
+        name: np.where(there, getattr(far, name), getattr(near, name))
+        for name in ("albedo", "light", "residual", "usable", "follows")
+    }
+    return GroundField(**parts, beyond=there)
+
+
+def _one_field(grey: Maps, usable: Bool[np.ndarray, "photos height width"]) -> GroundField:
     n, height, width = grey.shape
     brightness = np.log(np.maximum(grey, 1e-5)).reshape(n, -1)
     seen = usable.reshape(n, -1)
@@ -123,11 +145,11 @@ def at_photo_size(
     for _ in range(FIRST_ROUNDS):
         albedo = _albedo(level, flat, albedo, scale, False)
     residual = level - albedo
+    beyond = None if field.beyond is None else enlarged(field.beyond[None].astype(np.float32), height, width)[0] > 0.5
     follows = (flat & (np.abs(residual) < FITS * scale)).sum(0) / np.maximum(flat.sum(0), 1)
     shape = (height, width)
-    return GroundField(
-        albedo.reshape(shape), light, residual.reshape(-1, *shape), seen, follows.astype(np.float32).reshape(shape)
-    )
+    follows = follows.astype(np.float32).reshape(shape)
+    return GroundField(albedo.reshape(shape), light, residual.reshape(-1, *shape), seen, follows, beyond)
 
 
 def enlarged(maps: Float[np.ndarray, "photos small_height small_width"], height: int, width: int) -> Maps:

@@ -22,6 +22,7 @@ FEWEST_PHOTOS = 3
 PLINTH_GAP = 0.02  # of the picture's long side: between a plinth's side and what stands on it
 LEAST_STRIP = 0.3  # of the object's extent: a shorter strip is not the side of a plinth
 BENT = 1.5  # area of the convex hull of a plinth's side over its own; of a wall's foot: 1
+SEAM = 0.006  # of the picture's long side, to both sides of the line where the ground ends
 LINE_GAP = 5  # px: shorter gaps in a line across the picture are closed
 SEAM_LENGTH, SEAM_WIDTH = 0.12, 0.025  # of the picture's long side: a line this long and thin may be a wall's foot
 
@@ -42,7 +43,27 @@ def find_shadows(field: GroundField) -> GroundShadows:
     floor = np.exp(dark)[:, None, None]
     visibility = (np.exp(np.minimum(field.residual, 0.5)) - floor) / (1 - floor)
     likelihood = _likelihood(field, dark)
-    return GroundShadows(visibility.astype(np.float32), dark, likelihood, _largest(likelihood, field))
+    if field.beyond is None:
+        return GroundShadows(visibility.astype(np.float32), dark, likelihood, _largest(likelihood, field))
+    seam = _seam(field.beyond)
+    mask = _largest(_across(likelihood, seam), field)
+    no_ground = np.where(field.beyond | seam, np.float32(ODDS), likelihood)
+    return GroundShadows(visibility.astype(np.float32), dark, no_ground, mask)
+
+
+def _seam(beyond: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """Return the pixels at the line where the ground ends, in which neither side's field holds."""
+    disc = np.ones([2 * max(1, round(SEAM * max(beyond.shape))) + 1] * 2, np.uint8)
+    return cv2.morphologyEx(beyond.astype(np.uint8), cv2.MORPH_GRADIENT, disc) > 0
+
+
+def _across(
+    likelihood: Float[np.ndarray, "height width"], seam: Bool[np.ndarray, "height width"]
+) -> Float[np.ndarray, "height width"]:
+    """Return the likelihood with that of the seam taken from beside it, where less of the object is seen."""
+    disc = np.ones([2 * round(SEAM * max(seam.shape)) + 3] * 2, np.uint8)
+    beside = cv2.erode(np.where(seam, np.float32(ODDS), likelihood), disc)
+    return np.where(seam, beside, likelihood)
 
 
 def _dark_level(residual: Float[np.ndarray, "height width"], usable: Bool[np.ndarray, "height width"]) -> float:
@@ -53,6 +74,8 @@ def _dark_level(residual: Float[np.ndarray, "height width"], usable: Bool[np.nda
 def _likelihood(field: GroundField, dark: Float[np.ndarray, " photos"]) -> Float[np.ndarray, "height width"]:
     """Compare two models of each sample: ground (lit, in shadow, or seldom something else) and any brightness."""
     noise = max(NARROWEST, field.noise())
+    if field.beyond is not None:
+        noise = np.where(field.beyond, max(noise, field.noise(of_beyond=True)), noise)
     total, count = np.zeros_like(field.albedo), np.zeros_like(field.albedo)
     for residual, usable, level in zip(field.residual, field.usable, dark, strict=True):
         below = np.minimum(residual, level) - level  # deeper than the usual shadow is shadow, too
@@ -66,13 +89,14 @@ def _likelihood(field: GroundField, dark: Float[np.ndarray, " photos"]) -> Float
     return cv2.GaussianBlur((total / np.maximum(count, 1)).astype(np.float32), (0, 0), 0.7)
 
 
-def gaussian(values: np.ndarray, sigma: float) -> np.ndarray:
+def gaussian(values: np.ndarray, sigma: float | np.ndarray) -> np.ndarray:
     """Return the density of a normal distribution around 0."""
     return np.exp(-0.5 * (values / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
 
 
 def _largest(likelihood: Float[np.ndarray, "height width"], field: GroundField) -> Bool[np.ndarray, "height width"]:
-    likely = without_seams((likelihood > LIKELY) & (field.usable.sum(0) >= FEWEST_PHOTOS))
+    likely = (likelihood > LIKELY) & (field.usable.sum(0) >= FEWEST_PHOTOS)
+    likely = without_seams(likely) if field.beyond is None else likely
     parts = np.empty(likely.shape, np.int32)
     label(likely, output=parts)
     sizes = np.bincount(parts.ravel())

@@ -1,10 +1,12 @@
 """GroundCells: the brightness of each patch of ground under every light."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from calibration.ground.table_edges import TableEdge, find_table_edges, on_table
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
@@ -48,6 +50,23 @@ def ground_points(
     down = rays[..., 2] < -STEEPEST_VIEW
     reach = (posed_camera.ground_height - posed_camera.centre[2]) / np.where(down, rays[..., 2], -1.0)
     return posed_camera.centre + reach[..., None] * rays, down
+
+
+def ground_ends(
+    stack: PhotoStack, posed_camera: PosedCamera, usable: Bool[np.ndarray, " photos"]
+) -> tuple[TableEdge, ...]:
+    """Return the lines (world) at which the ground ends in these photos of the stack, none if it has no end in view."""
+    points, down = ground_points(posed_camera.resized(stack.rgb.shape[2], stack.rgb.shape[1]))
+    points = np.where(down[..., None], points, np.nan)
+    return find_table_edges(stack.rgb[usable], ~stack.clipped[usable], points, posed_camera.centre)
+
+
+def beyond_ends(
+    edges: Sequence[TableEdge], posed_camera: PosedCamera, shape: tuple[int, ...]
+) -> Bool[np.ndarray, "height width"] | None:
+    """Return the pixels of a picture (its height, width) that show what lies beyond the edges; None without edges."""
+    points, down = ground_points(posed_camera.resized(shape[1], shape[0]))
+    return ~(on_table(edges, points) & down) if edges else None
 
 
 def _cell_of_pixel(

@@ -17,6 +17,7 @@ from calibration.calibrated_views import CalibratedView, CalibratedViews
 from calibration.calibration import Calibration
 from calibration.ground.ground_field import fit_ground_field
 from calibration.ground.ground_shadows import LIKELY, find_shadows
+from calibration.lights.ground_cells import beyond_ends, ground_ends
 from calibration.pose import Pose
 from calibration.views.tangents import Silhouette, Tangent, tangents
 from capture.photos.photo import PhotoStack
@@ -53,7 +54,9 @@ def agree(views: CalibratedViews, stacks: Sequence[PhotoStack]) -> CalibratedVie
 def silhouette_mask(stack: PhotoStack, calibration: Calibration) -> Bool[np.ndarray, "height width"]:
     """Return the object as the used photos show it against the ground, on a finer grid than the ground's field."""
     used = np.array([light.used for light in calibration.lights])
-    field = fit_ground_field(stack.rgb[used], ~stack.clipped[used])
+    camera = calibration.posed_camera
+    beyond = beyond_ends(ground_ends(stack, camera, used), camera, stack.rgb.shape[1:3])
+    field = fit_ground_field(stack.rgb[used], ~stack.clipped[used], beyond)
     shadows = find_shadows(field)
     height, width = shadows.object_mask.shape
     size = (FINER * width, FINER * height)

@@ -56,6 +56,8 @@ class Table:
     """A wall this many mm behind the object, seen from the camera; 0 is none."""
     edge: float = 0.0
     """The table ends this many mm behind the object, and a floor lies 740 mm lower; 0 is a table without end."""
+    edge_turn: float = 0.0
+    """Degrees by which that edge is turned, seen from above; at 0 it lies across the camera's view."""
 
 
 @dataclass(frozen=True)

@@ -133,12 +133,12 @@ def wall_of(setup: Setup, thing: trimesh.Trimesh) -> Upright | None:
 
 def edge_of(setup: Setup, thing: trimesh.Trimesh) -> Upright | None:
     """Return the upright plane at which the table ends; its normal points over the table."""
-    return _upright(setup, thing, setup.table.edge) if setup.table.edge > 0 else None
+    return _upright(setup, thing, setup.table.edge, setup.table.edge_turn) if setup.table.edge > 0 else None
 
 
-def _upright(setup: Setup, thing: trimesh.Trimesh, behind: float) -> Upright:
-    """Return the plane across the camera's view, so many mm behind the object."""
-    normal = direction(0.0, setup.phone.azimuth)
+def _upright(setup: Setup, thing: trimesh.Trimesh, behind: float, turn: float = 0.0) -> Upright:
+    """Return the plane across the camera's view, turned by so many degrees, so many mm behind the object."""
+    normal = direction(0.0, setup.phone.azimuth + turn)
     return Upright(normal, float(normal @ thing.bounds.mean(0)) - behind)
 
 

@@ -16,7 +16,7 @@ from calibration.ground.contact_gaps import LIKELY as GAP
 from calibration.ground.contact_gaps import BareGround, without_gaps
 from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import LIKELY, find_shadows
-from calibration.ground.table_edges import find_table_edges, on_table
+from calibration.ground.table_edges import seen_beyond
 from reconstruct.labels.ground_test import (
     FEWEST_SAMPLES,
     GAP_CONFIDENCE,
@@ -43,7 +43,6 @@ TOO_DIM = 2.0  # log units below the photo's light near the object: the phone's 
 BRIGHT = 90.0  # per cent: the photo's light near the object
 NEAR = 1.0  # of the object's size in the picture: what is near it
 TONE_SHARE = 0.1  # one sigma of the object's brightness under a beam and a tone curve that nobody knows
-REACH_STEP = 4  # px between the points by which the table's edges are found
 BACKGROUND = 0.01  # of the picture: a smaller part that is no ground is a stain or a highlight
 SECTORS = 72  # of the view from the point below the camera, in which the ground ends at the nearest background
 NEAREST = 5.0  # per cent of a sector's background that may be nearer
@@ -72,35 +71,32 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     if before is not None or scene.ground_depth is not None:
         return tested
     joined = scene.mask is None and reaches_border(tested.mask > 0.5)  # the object, perhaps, to what lies behind it
-    background = _beyond_table(scene, tested) if joined else None
-    by_model = tested if background is None else test_ground(scene, background)
+    beyond = _beyond(scene) if joined or tested.explained < EXPLAINED else None
+    by_model = tested if beyond is None or not joined else test_ground(scene, _background_beyond(scene, beyond))
     if tested.explained >= EXPLAINED:
         return by_model
     assert scene.rgb is not None
     rgb, usable = scene.rgb.numpy(), scene.usable.numpy()
-    field = at_photo_size(fit_ground_field(rgb, usable), rgb, usable)
+    field = at_photo_size(fit_ground_field(rgb, usable, beyond), rgb, usable)
     if by_model.explained >= EXPLAINED and by_model.noise.share < QUIETER * field.noise():
         return by_model  # it explains all of the table, and better
     share = float((field.follows > FOLLOWS).mean())
     return _by_field(scene, field) if share > tested.explained + GAINED else by_model
 
 
-def _beyond_table(scene: Scene, tested: GroundTest) -> Bool[Tensor, "height width"] | None:
-    """Return what is seen beyond the table's edges, without the object before it; None if the table has no end.
+def _beyond(scene: Scene) -> Bool[np.ndarray, "height width"] | None:
+    assert scene.rgb is not None
+    points, eye = ground_points(scene).double().numpy(), scene.eye.double().numpy()
+    return seen_beyond(scene.rgb.numpy(), scene.usable.numpy(), points, eye)
+
+
+def _background_beyond(scene: Scene, beyond: Bool[np.ndarray, "height width"]) -> Bool[Tensor, "height width"]:
+    """Return what is seen beyond the ground's end without the object before it.
 
     Floor and wall have a smooth field of light of their own, which the object does not follow. What is too dark in
     nearly all photos is none of the object either.
     """
     assert scene.rgb is not None
-    points = ground_points(scene).double().numpy()
-    finite = np.isfinite(points[..., 0])
-    few = np.zeros_like(finite)
-    few[::REACH_STEP, ::REACH_STEP] = True
-    follows = (tested.albedo > 0).any(-1).numpy()
-    edges = find_table_edges(points[few & finite], follows[few & finite].astype(float), scene.eye.double().numpy())
-    if not edges:
-        return None
-    beyond = ~on_table(edges, points)
     rgb, usable = scene.rgb.numpy(), scene.usable.numpy() & beyond
     field = at_photo_size(fit_ground_field(rgb, usable), rgb, usable)
     smooth = (
@@ -116,6 +112,7 @@ def _by_field(scene: Scene, field: GroundField) -> GroundTest:
     points = ground_points(scene).double().numpy()
     visibility, confidence = _visibility(bare)
     trusted = _well_lit(bare.field, region) & ~_background(scene, bare, region, points)
+    trusted &= True if field.beyond is None else ~field.beyond
     trusted &= may_hold_shadow(scene, mask > 0.5).numpy()
     beside = dilated(mask > 0.5, 2 * RIM + 1)
     confidence *= torch.from_numpy(trusted) * (1 - mask) * torch.where(beside, RIM_SHARE, 1.0)
