@@ -96,7 +96,7 @@ def fewer(monkeypatch) -> None:
 def laid():
     """The scene of the object laid on another side, and object_from_world."""
     shapes, motion = lying()
-    scene, _ = render(shapes, Look(width=64, height=48, n_lights=6, seed=3), default_camera(64, 48))
+    scene, _ = render(shapes, Look(width=64, height=48, n_lights=8, seed=3), default_camera(64, 48))
     return replace(scene, view="turned_1", light_sigma=torch.full_like(scene.lights[:, :3], 2.0)), motion
 
 
