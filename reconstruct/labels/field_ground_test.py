@@ -18,7 +18,6 @@ from calibration.ground.ground_field import GroundField, at_photo_size, fit_grou
 from calibration.ground.ground_shadows import LIKELY, find_shadows
 from calibration.ground.table_edges import seen_beyond
 from reconstruct.labels.ground_test import (
-    FEWEST_SAMPLES,
     GAP_CONFIDENCE,
     NOISE_FLOOR,
     PIXELS_AT_ONCE,
@@ -29,7 +28,7 @@ from reconstruct.labels.ground_test import (
 )
 from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.multiple_lights import is_shared, split_on_ground
-from reconstruct.labels.outline import dilated, may_hold_shadow, object_region, reaches_border
+from reconstruct.labels.outline import dilated, may_hold_shadow, object_region
 from reconstruct.scene import Scene, grey_irradiance, ground_points
 from reconstruct.shading.noise import Noise
 
@@ -70,39 +69,25 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     tested = test_ground(scene, None if before is None else before.background)
     if before is not None or scene.ground_depth is not None:
         return tested
-    joined = scene.mask is None and reaches_border(tested.mask > 0.5)  # the object, perhaps, to what lies behind it
-    beyond = _beyond(scene) if joined or tested.explained < EXPLAINED else None
-    by_model = tested if beyond is None or not joined else test_ground(scene, _background_beyond(scene, beyond))
-    if tested.explained >= EXPLAINED:
-        return by_model
     assert scene.rgb is not None
     rgb, usable = scene.rgb.numpy(), scene.usable.numpy()
+    points, eye = ground_points(scene).double().numpy(), scene.eye.double().numpy()
+    beyond = seen_beyond(rgb, usable, points, eye)
+    if beyond is None and tested.explained >= EXPLAINED:
+        return tested
     field = at_photo_size(fit_ground_field(rgb, usable, beyond), rgb, usable)
+    by_model = tested if beyond is None else test_ground(scene, _without_object(field, beyond))
+    if tested.explained >= EXPLAINED:
+        return by_model
     if by_model.explained >= EXPLAINED and by_model.noise.share < QUIETER * field.noise():
         return by_model  # it explains all of the table, and better
     share = float((field.follows > FOLLOWS).mean())
     return _by_field(scene, field) if share > tested.explained + GAINED else by_model
 
 
-def _beyond(scene: Scene) -> Bool[np.ndarray, "height width"] | None:
-    assert scene.rgb is not None
-    points, eye = ground_points(scene).double().numpy(), scene.eye.double().numpy()
-    return seen_beyond(scene.rgb.numpy(), scene.usable.numpy(), points, eye)
-
-
-def _background_beyond(scene: Scene, beyond: Bool[np.ndarray, "height width"]) -> Bool[Tensor, "height width"]:
-    """Return what is seen beyond the ground's end without the object before it.
-
-    Floor and wall have a smooth field of light of their own, which the object does not follow. What is too dark in
-    nearly all photos is none of the object either.
-    """
-    assert scene.rgb is not None
-    rgb, usable = scene.rgb.numpy(), scene.usable.numpy() & beyond
-    field = at_photo_size(fit_ground_field(rgb, usable), rgb, usable)
-    smooth = (
-        cv2.medianBlur(((field.follows > FOLLOWS) | (field.usable.sum(0) < FEWEST_SAMPLES)).astype(np.uint8), 5) > 0
-    )
-    return torch.from_numpy(beyond & smooth)
+def _without_object(field: GroundField, beyond: Bool[np.ndarray, "height width"]) -> Bool[Tensor, "height width"]:
+    """Return what is seen beyond the ground's end: there, too, light is smooth and shadows fall, but on no ground."""
+    return torch.from_numpy(beyond & ~find_shadows(field).object_mask)
 
 
 def _by_field(scene: Scene, field: GroundField) -> GroundTest:
