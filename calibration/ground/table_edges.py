@@ -77,12 +77,16 @@ def find_table_edges(
 ) -> tuple[TableEdge, ...]:
     """Return the lines at which the ground ends, none if it has no end in view.
 
+    In a smaller picture than is looked at (COARSE) none is found: outlines and shadows are as wide as the strips there.
+
     Args:
         rgb: linear photos of one fixed camera, relative exposure divided out.
         usable: False where a sample is clipped or unknown.
         points: of the ground in each pixel, world; nan above the horizon.
         eye: camera centre, world; the point below it is on the table.
     """
+    if max(rgb.shape[1:3]) < COARSE:
+        return ()
     some = np.unique(np.linspace(0, len(rgb) - 1, min(len(rgb), MOST_PHOTOS)).round().astype(int))
     fine = _levels(rgb[some], usable[some], FINE)
     coarse = _levels(rgb[some], usable[some], COARSE)
