@@ -85,6 +85,20 @@ def test_an_exposure_that_changes_from_photo_to_photo_is_no_edge_and_hides_none(
     assert len(find_table_edges(ends, everywhere(ends), points, EYE)) == 1
 
 
+@pytest.mark.parametrize(("share", "count"), [(0.45, 1), (0.85, 0)])
+def test_a_wall_may_fill_half_of_the_picture_but_not_all_but_the_object(share, count):
+    points, rng = table_points(), np.random.default_rng(5)
+    beyond = outside(points, 90.0, float(np.nanquantile(points[..., 1], 1 - share)))
+    rgb = photos(points, ~beyond, 700.0, rng)
+    assert len(find_table_edges(rgb, everywhere(rgb), points, EYE)) == count
+
+
+def test_in_a_picture_smaller_than_is_looked_at_no_edge_is_found():
+    points, rng = table_points(), np.random.default_rng(6)
+    rgb = photos(points, ~outside(points, 90.0, 110.0), 700.0, rng)[:, ::4, ::4]
+    assert not find_table_edges(rgb, everywhere(rgb), points[::4, ::4], EYE)
+
+
 def test_no_ground_and_no_shadow_is_seen_beyond_the_edge_and_the_object_before_it_is_whole():
     points, rng = table_points(), np.random.default_rng(4)
     beyond = outside(points, 90.0, 60.0)

@@ -31,6 +31,7 @@ FEWEST_PHOTOS = 4  # and half of all, that show a step
 LEAST_LENGTH = 0.25  # of the picture's width
 MOST_PHOTOS = 24
 MOST_EDGES = 3
+LEAST_TABLE = 0.3  # of what is in view; a wall may fill half of it. A line that leaves less is another step of light
 ON_LINE = 32  # points of the ground that a line of the picture is carried over by
 
 
@@ -90,11 +91,12 @@ def find_table_edges(
     some = np.unique(np.linspace(0, len(rgb) - 1, min(len(rgb), MOST_PHOTOS)).round().astype(int))
     fine = _levels(rgb[some], usable[some], FINE)
     coarse = _levels(rgb[some], usable[some], COARSE)
+    seen = points[np.isfinite(points).all(-1)]
     edges: list[TableEdge] = []
     while len(edges) < MOST_EDGES:
         line = _sharpest(coarse, fine)
         edge = None if line is None else _on_ground(line, points, eye, fine.shape[1:])
-        if edge is None:
+        if edge is None or on_table([*edges, edge], seen).mean() < LEAST_TABLE:
             break
         edges.append(edge)
         for level in (coarse, fine):
