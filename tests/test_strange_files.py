@@ -216,6 +216,17 @@ def test_an_archive_that_lies_about_its_size_gives_no_more_than_it_said(tmp_path
         tracemalloc.stop()
 
 
+def test_an_archive_whose_name_runs_into_its_data_is_refused_without_quoting_them(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, light_pose=np.random.default_rng(0).normal(size=(40, 4)))
+    data = bytearray(path.read_bytes())
+    data[26:28] = struct.pack("<H", 1200)  # the length of the first name, in the header before its data
+    path.write_bytes(bytes(data))
+    with pytest.raises(CalibrationError) as refused:
+        read_npz(path, ("light_pose",))
+    assert str(path) in str(refused.value) and len(str(refused.value)) < len(str(path)) + 500
+
+
 @pytest.mark.parametrize("kind", [np.float32, np.int16, bool])
 def test_arrays_of_any_numbers_come_back_in_any_order_of_memory(tmp_path, kind):
     wanted = np.asfortranarray(np.arange(24).reshape(2, 3, 4) % 2).astype(kind)

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from numpy.lib import format as npy
 
 from capture.errors import CalibrationError
+from capture.files.regular import why
 
 LARGEST_FILE = 64 * 2**20  # bytes, unpacked: a hundred thousand lights, or a depth map of eight megapixels
 NUMBERS = "fiub"  # kinds of numpy dtypes: floats, integers, booleans
@@ -35,7 +36,7 @@ def read_npy(path: Path, largest: int = LARGEST_FILE) -> Float[np.ndarray, "..."
             raise _too_large(path, largest)
         return _numbers(path.read_bytes())
     except _DAMAGED as error:
-        raise CalibrationError(f"{path} is no readable .npy array of numbers ({error}); export it again.") from error
+        raise CalibrationError(f"{path} is no readable array of numbers ({why(error)}); export it again.") from error
 
 
 def read_npz(path: Path, names: tuple[str, ...], largest: int = LARGEST_FILE) -> dict[str, Float[np.ndarray, "..."]]:
@@ -53,11 +54,11 @@ def read_npz(path: Path, names: tuple[str, ...], largest: int = LARGEST_FILE) ->
             missing = [name for name in names if name not in found]
             if missing:
                 raise CalibrationError(
-                    f"{path} holds {', '.join(sorted(found)[:8]) or 'nothing'}; {', '.join(missing)} was needed."
+                    f"{path} holds {', '.join(sorted(found)[:8])[:200] or 'nothing'}; {', '.join(missing)} was needed."
                 )
             return {name: _numbers(_unpacked(packed, found[name])) for name in names}
     except _DAMAGED as error:
-        raise CalibrationError(f"{path} cannot be read ({error}); {', '.join(names)} were needed.") from error
+        raise CalibrationError(f"{path} cannot be read ({why(error)}); {', '.join(names)} were needed.") from error
 
 
 def _unpacked(packed: zipfile.ZipFile, part: zipfile.ZipInfo) -> bytes:

@@ -181,7 +181,7 @@ def read_json(path: Path) -> Any:
     try:
         return parse_json(text)
     except ValueError as error:  # no JSON, or digits and brackets without end
-        raise CalibrationError(f"{path} is not JSON ({error}); export the scene again.") from error
+        raise CalibrationError(f"{path} is not JSON ({why(error)}); export the scene again.") from error
 
 
 def read_document(path: Path, advice: str = CORRECT) -> JsonField:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from capture.errors import CaptureError
+from capture.files.regular import why
 from capture.intake.arrivals import MOST_FILES, largest_size, place_in, refuse_full_disk, safe_name, settle
 
 MOST_ENTRIES = 20_000  # of any kind: phones and macOS add their own
@@ -59,7 +60,7 @@ def unpack(archive: Path, capture: Path, role: str = "") -> Unpacked:
                     break
     except DAMAGED as error:
         raise CaptureError(
-            f"the archive is damaged or no .zip ({error}). Pack it again, or send the photos."
+            f"the archive is damaged or no .zip ({why(error)}). Pack it again, or send the photos."
         ) from error
     return Unpacked(tuple(arrived), tuple(remarks[:REMARKS]))
 

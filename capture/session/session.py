@@ -11,6 +11,7 @@ from typing import Any
 from capture.decode.formats import format_of, is_photo_name
 from capture.errors import CaptureError
 from capture.files.names import clip_of, is_clip_name, natural_order, stored_file
+from capture.files.regular import why
 from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
 from capture.session.declared_objects import (
     DeclaredObjects,
@@ -156,7 +157,7 @@ def read_entries(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text("utf-8-sig"))  # Windows' editors write a byte-order mark
     except (OSError, ValueError) as error:
-        raise CaptureError(f"{path} is not valid TOML ({error}). Correct it, or remove the file.") from error
+        raise CaptureError(f"{path} is not valid TOML ({why(error)}). Correct it, or remove the file.") from error
 
 
 def parse_length(value: Any, where: str) -> float:

@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from calibration.calibration import load_calibration
 from capture.errors import ReconstructionError
+from capture.files.regular import why
 from reconstruct.evaluate.surface_distance import ICP_POINTS, Similarity, register, signed_distance_to_mesh
 from reconstruct.mesh.mesh import MM_PER_METRE
 from reconstruct.stored_run.ply import read_mesh
@@ -48,7 +49,7 @@ def load_reference(path: Path) -> ReferenceMesh:
         mesh = read_mesh(file) if path.is_dir() else trimesh.load_mesh(file, process=False)
     except (ValueError, IndexError, KeyError, NotImplementedError, OSError, ImportError, MemoryError) as error:
         raise ReconstructionError(
-            f"--reference {path}: not a mesh that can be read ({error}); .ply, .obj, .stl, .off and .glb can."
+            f"--reference {path}: not a mesh that can be read ({why(error)}); .ply, .obj, .stl, .off and .glb can."
         ) from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise ReconstructionError(f"--reference {path}: it holds no triangles; a surface was needed, not points.")
