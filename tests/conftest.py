@@ -5,6 +5,7 @@ The numba kernels cannot carry such wrappers.
 
 import fcntl
 import os
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,20 +21,31 @@ MOST_WORKERS = 8  # each takes up to 1.5 GB
 LONGEST_FIRST = (  # seconds of a file are not known before it ran: these took 8 and more
     "test_examples",
     "test_pretend_card",
-    "test_shading",
     "test_phone",
     "test_light_refine",
-    "test_solver",
+    "test_studio_browser",
+    "test_solve_views",
+    "test_stage_page",
+    "test_studio_saving",
     "test_viewer_browser",
-    "test_trainer",
-    "test_end_to_end",
+    "test_stored_run",
+    "test_shading",
+    "test_confined",
+    "test_view_agreement",
     "test_torch_operators",
+    "test_studio_stage",
+    "test_phone_back",
+    "test_observe",
+    "test_trainer",
+    "test_solver",
+    "test_level_tops",
+    "test_viewer_safety",
+    "test_end_to_end",
     "test_relight",
     "test_faults",
     "test_steering",
     "test_viewer",
     "test_crash",
-    "test_level_tops",
     "test_importers",
     "test_report",
     "test_several_lights",
@@ -41,11 +53,7 @@ LONGEST_FIRST = (  # seconds of a file are not known before it ran: these took 8
     "test_relief",
     "test_declared_lights",
     "test_camera",
-    "test_phone_back",
-    "test_observe",
-    "test_confined",
     "test_inspect_browser",
-    "test_stage_page",
     "test_run_browser",
     "test_save_panel",
 )
@@ -66,11 +74,14 @@ install_import_hook(CHECKED, "checked_signatures.when_called")
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """One per core for whole folders; none for single files, which are done before a second process has started."""
+    """One per core, and one for when tests wait for a page or a server, for whole folders; none for single files.
+
+    Those are done before a second process has started. One per core left two cores idle for a fourth of the time.
+    """
     if not all(Path(argument).is_dir() for argument in config.args):
         return 0
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, MOST_WORKERS)
+    return min(cores + 1, MOST_WORKERS)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -172,6 +183,31 @@ def truth():
     import fake_run
 
     return fake_run.make_truth(width=96, n_lights=6)
+
+
+@pytest.fixture(scope="session")
+def finished_run(request) -> Callable[..., Path]:
+    """Copies `heap` of one finished run of balls and a box, with the mesh that a run extracts: finished_run(folder)."""
+
+    def make(top: Path) -> None:
+        import fake_run
+
+        from reconstruct.mesh.mesh import extract_mesh, save_mesh
+        from viewer.stage.pack_file import write_stage
+
+        truth, run = request.getfixturevalue("truth"), top / "heap"
+        fake_run.start_run(run, truth)
+        fake_run.finish_run(run, truth)
+        save_mesh(extract_mesh(fake_run.fields_of(truth)), run / "mesh.ply", run / "mesh.glb", "mm")
+        write_stage(run)
+
+    made = made_once(request, "finished", make) / "heap"
+
+    def copy(folder: Path, has_stage: bool = False) -> Path:
+        left_out = None if has_stage else shutil.ignore_patterns("stage.zip")
+        return Path(shutil.copytree(made, folder / "heap", ignore=left_out))
+
+    return copy
 
 
 @pytest.fixture

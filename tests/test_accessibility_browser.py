@@ -7,13 +7,10 @@ AXE_CORE=path/to/axe.min.js.
 import os
 from pathlib import Path
 
-import finished_run
 import pytest
 from chromium import CHROMIUM, PATIENCE_MS, wait_until
 from studio_client import served
 from test_studio import capture_in, run_in
-
-from viewer.stage.pack_file import write_stage
 
 ROOT = Path(__file__).parent.parent
 AXE = Path(os.environ.get("AXE_CORE") or ROOT / "node_modules" / "axe-core" / "axe.min.js")
@@ -34,9 +31,9 @@ SIZES = [{"width": 1600, "height": 1000}, {"width": 390, "height": 844}]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(finished_run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("studio")
-    write_stage(finished_run.make(folder / "runs"))
+    finished_run(folder / "runs", has_stage=True)
     capture_in(folder, "vase")
     run_in(folder, "vase", is_finished=False, message="a level")
     return folder

@@ -4,7 +4,6 @@ import json
 import shutil
 from dataclasses import replace
 
-import finished_run
 import numpy as np
 import pytest
 import torch
@@ -25,8 +24,8 @@ SMALL = ExportOptions(texture=128, faces=4000)
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    return finished_run.make(tmp_path_factory.mktemp("runs"))
+def run(finished_run, tmp_path_factory):
+    return finished_run(tmp_path_factory.mktemp("runs"))
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ import zipfile
 from pathlib import Path
 
 import cv2
-import finished_run
 import numpy as np
 import pytest
 import trimesh
@@ -32,8 +31,8 @@ SMALL = ExportOptions(faces=800, texture=128, width=160, frames=3, lamp_size=0.0
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    return finished_run.make(tmp_path_factory.mktemp("runs"))
+def run(finished_run, tmp_path_factory):
+    return finished_run(tmp_path_factory.mktemp("runs"))
 
 
 @pytest.fixture(scope="module")

@@ -121,6 +121,7 @@ def test_a_gradient_that_is_no_number_is_found_even_if_the_errors_are(scene, mon
 # --- processes -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_sigterm_saves_the_last_rest_and_leaves_within_five_seconds(tmp_path):
     truth = render(HEAP, Look(width=80, height=60, n_lights=8, texture=0.1))[1]
     scene, out = write_scene(tmp_path / "heap", truth), tmp_path / "out"

@@ -37,6 +37,7 @@ def near_colour(rgb: np.ndarray, colour) -> int:
     return max(int((np.abs(rgb - shade) < 14).all(-1).sum()) for shade in linear_shades)
 
 
+@pytest.mark.slow
 def test_what_is_known_colours_the_mesh_as_its_legend_says_and_gold_changes_the_picture(browser, finished):
     tab, bad = open_page(browser, finished.url)
     tab.get_by_text("from the surface found").wait_for()

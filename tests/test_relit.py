@@ -1,7 +1,6 @@
 """Truth: the renderer's own picture under the same light, and shadows whose place is known."""
 
 import cv2
-import finished_run
 import numpy as np
 import pytest
 import torch
@@ -19,8 +18,8 @@ WIDTH = 64
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    return finished_run.make(tmp_path_factory.mktemp("runs"))
+def run(finished_run, tmp_path_factory):
+    return finished_run(tmp_path_factory.mktemp("runs"))
 
 
 def relit(run, tmp_path, *arguments, name="it.exr"):

@@ -44,6 +44,7 @@ def opened(browser, url):
     return tab, left
 
 
+@pytest.mark.slow
 def test_a_pause_pressed_in_one_tab_is_seen_in_another_and_after_a_reload(browser, followed, tmp_path):
     run = tmp_path / "heap"
     tab, left = opened(browser, followed.url)

@@ -4,7 +4,6 @@ import threading
 import time
 from types import SimpleNamespace
 
-import finished_run
 import pytest
 import trimesh
 from chromium import Followed, open_page, wait_until
@@ -17,8 +16,8 @@ from viewer.report.formats import FORMATS
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    return finished_run.make(tmp_path_factory.mktemp("runs"))
+def run(finished_run, tmp_path_factory):
+    return finished_run(tmp_path_factory.mktemp("runs"))
 
 
 class Client:

@@ -7,7 +7,6 @@ import shutil
 import time
 from collections.abc import Callable
 
-import finished_run
 import numpy as np
 import pytest
 import torch
@@ -40,8 +39,8 @@ LAMP = {"azimuth": 2.4, "elevation": 0.8, "distance": 600.0, "radius": 0.0, "str
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    return finished_run.make(tmp_path_factory.mktemp("runs"))
+def run(finished_run, tmp_path_factory):
+    return finished_run(tmp_path_factory.mktemp("runs"))
 
 
 @pytest.fixture(scope="module")

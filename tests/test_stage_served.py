@@ -4,7 +4,6 @@ import json
 import urllib.error
 import urllib.request
 
-import finished_run
 import pytest
 import websockets.sync.client
 from chromium import wait_until
@@ -14,14 +13,11 @@ from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
 from viewer.page.guard import GuardedServer
 from viewer.page.serve import address_lines
 from viewer.stage.files import StageFiles
-from viewer.stage.pack_file import write_stage
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    run = finished_run.make(tmp_path_factory.mktemp("runs"))
-    write_stage(run)
-    return run
+def run(finished_run, tmp_path_factory):
+    return finished_run(tmp_path_factory.mktemp("runs"), has_stage=True)
 
 
 @pytest.fixture(scope="module")

@@ -3,14 +3,11 @@
 import os
 from pathlib import Path
 
-import finished_run
 import pytest
-from chromium import CHROMIUM, PATIENCE_MS, SOFTWARE_GL
+from chromium import CHROMIUM, NO_DRAWING, PATIENCE_MS, SOFTWARE_GL
 from studio_client import served
 from test_intake import jpeg
 from test_studio import capture_in, program, run_in  # noqa: F401  a fixture
-
-from viewer.stage.pack_file import write_stage
 
 playwright = pytest.importorskip("playwright.sync_api")
 pytestmark = [
@@ -29,13 +26,15 @@ def browser():
         opened.close()
 
 
-def opened(browser, client, size):
-    """A page of the studio, and all that it complained about or asked of others."""
+def opened(browser, client, size, is_drawn: bool = True):
+    """A page of the studio, and all that it complained about or asked of others; without 3-D pictures it costs less."""
     context = browser.new_context(viewport=size)
     name, _, value = client.cookie.partition("=")
     address = f"http://127.0.0.1:{client.port}"
     context.add_cookies([{"name": name, "value": value, "url": address}])
     tab = context.new_page()
+    if not is_drawn:
+        tab.add_init_script(NO_DRAWING)
     tab.set_default_timeout(PATIENCE_MS)
     bad = []
     tab.on("console", lambda message: bad.append(message.text) if message.type == "error" else None)
@@ -157,13 +156,12 @@ def test_names_of_strangers_are_text_and_mistakes_are_sentences(browser, tmp_pat
         assert not [text for text in bad if "400" not in text]
 
 
-def test_cards_are_searched_renamed_and_compared_and_a_result_is_saved(browser, tmp_path):
+def test_cards_are_searched_renamed_and_compared_and_a_result_is_saved(browser, finished_run, tmp_path):
+    (tmp_path / "runs").mkdir()
     for name in ("one", "two"):
-        write_stage(finished_run.make(tmp_path / name))
-        (tmp_path / "runs").mkdir(exist_ok=True)
-        (tmp_path / name / "heap").rename(tmp_path / "runs" / name)
+        finished_run(tmp_path / name, has_stage=True).rename(tmp_path / "runs" / name)
     with served(tmp_path) as (_, _, owner):
-        tab, bad = opened(browser, owner, DESKTOP)
+        tab, bad = opened(browser, owner, DESKTOP, is_drawn=False)
         tab.wait_for_selector(".card >> nth=1")
         tab.fill("input[type=search]", "tw")
         tab.wait_for_selector(".card >> nth=1", state="detached")

@@ -5,7 +5,6 @@ import sys
 from urllib.parse import quote
 
 import fake_run
-import finished_run
 import numpy as np
 import pytest
 import trimesh
@@ -21,9 +20,9 @@ RUN = "runs/heap"
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(finished_run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("studio")
-    finished_run.make(folder / "runs")
+    finished_run(folder / "runs")
     return folder
 
 
@@ -83,6 +82,7 @@ def row_of(owner, name: str) -> dict:
     return next((row for row in owner.get(f"/api/saved?key={quote(RUN)}")[1] if row["name"] == name), {})
 
 
+@pytest.mark.slow
 def test_a_video_says_how_far_it_is_lets_others_pass_and_is_cancelled(folder):
     with served(folder) as (studio, _, owner):
         assert not owner.ok("save", key=RUN, format="turntable", size="")["file"]

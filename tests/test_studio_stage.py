@@ -3,7 +3,6 @@
 import json
 from concurrent.futures import Future
 
-import finished_run
 import pytest
 from chromium import CHROMIUM, PATIENCE_MS, wait_until
 from studio_client import Client, served
@@ -13,7 +12,6 @@ from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
 from reconstruct.stored_run.stage_pack import STAGE_PACK
 from viewer.report.formats import FORMATS
 from viewer.stage.files import StageFiles
-from viewer.stage.pack_file import write_stage
 
 PAGE, DOCUMENT = "/stage/runs/heap/", "/stage/runs/heap/stage.json"
 NOTED = json.dumps(
@@ -22,9 +20,9 @@ NOTED = json.dumps(
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(finished_run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("studio")
-    write_stage(finished_run.make(folder / "runs"))
+    finished_run(folder / "runs", has_stage=True)
     return folder
 
 

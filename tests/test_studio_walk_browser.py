@@ -3,15 +3,12 @@
 Slow, for the draft is a real one. A picture of each step lies in the test's folder (`--basetemp`).
 """
 
-import finished_run
 import pytest
 from chromium import CHROMIUM, wait_until
 from small_example import small_example
 from studio_client import served
 from test_studio import capture_in, program  # noqa: F401  a fixture
 from test_studio_browser import DESKTOP, PHONE, RULES, browser, opened  # noqa: F401  a fixture
-
-from viewer.stage.pack_file import write_stage
 
 pytestmark = [
     pytest.mark.browser,
@@ -115,8 +112,8 @@ def press_until(tab, words: str, frame=None) -> None:
     raise AssertionError(f"{words} cannot be reached by the keyboard, only {passed}")
 
 
-def test_the_keyboard_alone_starts_a_run_and_lights_turns_and_edits_a_result(browser, tmp_path, program):  # noqa: F811
-    write_stage(finished_run.make(tmp_path / "runs"))
+def test_the_keyboard_alone_starts_a_run_and_lights_turns_and_edits_a_result(browser, finished_run, tmp_path, program):  # noqa: F811
+    finished_run(tmp_path / "runs", has_stage=True)
     capture_in(tmp_path, "vase")
     with served(tmp_path, program) as (_, _, owner):
         tab, bad = opened(browser, owner, DESKTOP)

@@ -60,6 +60,7 @@ def test_the_page_shows_a_growing_mesh_and_a_reload_shows_where_the_run_is_now(b
     tab.close()
 
 
+@pytest.mark.slow
 def test_a_light_that_is_moved_changes_the_computed_picture(finished):
     page, tab, _ = finished
     before = pictures(tab)  # chosen by number: the lamp goes where that photo's light was

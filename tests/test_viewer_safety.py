@@ -312,6 +312,7 @@ def nonsense(random_numbers: random.Random) -> bytes | str:
     )
 
 
+@pytest.mark.slow
 def test_ten_thousand_malformed_frames_leave_the_server_alive_and_its_memory_bounded(server):
     random_numbers, before = random.Random(5), psutil.Process().memory_info().rss
     for _ in range(FRAMES // FRAMES_AT_ONCE):

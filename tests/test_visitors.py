@@ -16,6 +16,7 @@ from viewer.page.visitors import Visitors
 pytestmark = pytest.mark.browser
 
 
+@pytest.mark.slow
 def test_what_one_visitor_switches_the_other_does_not_see_and_who_leaves_is_forgotten(browser, truth, tmp_path):
     run = tmp_path / "heap"
     fake_run.start_run(run, truth)
