@@ -6,15 +6,20 @@ import numpy as np
 import pytest
 import torch
 from jaxtyping import Float
+from torch.nn.functional import normalize
 
 from calibration.light import Light
 from reconstruct.fields import Fields, load_fields, save_fields
+from reconstruct.labels import ground_test as ground_module
+from reconstruct.labels.observer import Observer
+from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.render.g_buffer import look
 from reconstruct.render.interreflection import photo_interreflection, true_scale
 from reconstruct.render.radiosity import find_patches, nearest_patches
 from reconstruct.render.relight import environment, relight, relight_soft
 from reconstruct.sdf.grid import SdfGrid
-from tests.synthetic import BALL, Look, render
+from tests.fake_run import fields_of
+from tests.synthetic import BALL, HEAP, Look, render
 from tests.test_relight import CAMERA, CENTRE, POSE, RADIUS, sphere_grid
 
 HEIGHT = float(CENTRE[2])
@@ -145,3 +150,26 @@ def test_how_white_surfaces_are_shows_in_what_they_send_each_other(true):
     on_ball = torch.from_numpy(truth.mask)
     photos.rgb[:, on_ball] += true * albedo[on_ball] * interreflection.at(at[on_ball], facing[on_ball])
     assert math.isclose(true_scale(fields, photos, interreflection), true, abs_tol=0.03)
+
+
+def test_light_between_surfaces_turns_no_normals():
+    """Three solids that stand close, whose light for each other the photos show: their creases look flat without it."""
+    photos, truth = render(HEAP, Look(width=160, height=120, n_lights=20, noise=0.002))
+    fields = fields_of(truth)
+    interreflection = photo_interreflection(fields, photos)
+    assert interreflection is not None and photos.rgb is not None
+    on = torch.from_numpy(truth.mask)
+    albedo, at, facing = (torch.from_numpy(a).float()[on] for a in (truth.albedo, truth.points, truth.normals))
+    sent = interreflection.at(at, facing)
+    photos.rgb[:, on] += albedo * sent
+    observer = Observer(photos)
+    points, normals = observer.seen(fields.grid)
+    endless = label_object(photos, points, normals, on.float(), ground_module.test_ground(photos)).normals
+    ours = observer.labels(fields.grid, photos).normals
+    in_creases = sent.mean((0, 2)) > sent.mean((0, 2)).quantile(0.7)
+
+    def degrees_off(found: torch.Tensor) -> float:
+        cosine = (normalize(found[on], dim=-1) * facing).sum(-1)[in_creases]
+        return float(torch.rad2deg(cosine.clamp(-1, 1).arccos()).median())
+
+    assert degrees_off(ours) < 0.3 * degrees_off(endless)

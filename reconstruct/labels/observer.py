@@ -80,7 +80,7 @@ class Observer:
             scene = split_on_surface(scene, surface, points, normals, self._ground)
             self._ground = test_ground(scene)
         scene = with_free_powers(scene, points, normals, self._ground)
-        on_object = self._on_object(scene, points, normals)
+        on_object = self._on_object(surface, scene, points, normals)
         return self._beside_relief(assemble_labels(scene, self._ground, on_object), surface)
 
     def with_normals(self, labels: Labels, surface: SdfGrid, scene: Scene) -> Labels:
@@ -90,22 +90,39 @@ class Observer:
         return with_lit_normals(labels, scene, self.in_world(surface), *self.seen(surface))
 
     def _on_object(
-        self, scene: Scene, points: Float[Tensor, "height width 3"], normals: Float[Tensor, "height width 3"]
+        self,
+        surface: SdfGrid,
+        scene: Scene,
+        points: Float[Tensor, "height width 3"],
+        normals: Float[Tensor, "height width 3"],
     ) -> ObjectLabels:
-        """Label the object's pixels from shading, with highlights removed if it is glossy."""
+        """Label the object's pixels from shading, with highlights removed if it is glossy.
+
+        A first look under an endless ground gives the albedo with which light between surfaces is found.
+        """
         assert self._ground is not None
         on_object = label_object(scene, points, normals, self._ground.mask, self._ground)
-        matt = self._matt(scene, points, on_object)
+        albedo = self._beside_ground(on_object.albedo, normals)
+        indirect = self._between_surfaces(self._solved(surface, scene, albedo, None), scene)[1]
+        if indirect is not None:
+            on_object = label_object(scene, points, normals, self._ground.mask, self._ground, indirect)
+        matt = self._matt(scene, points, on_object, indirect)
         if matt is None:
             return on_object
-        again = label_object(matt, points, normals, self._ground.mask, self._ground)
+        again = label_object(matt, points, normals, self._ground.mask, self._ground, indirect)
         lit = torch.maximum(on_object.visibility, again.visibility)  # an over-corrected highlight is no shadow
         return replace(again, visibility=lit)
 
-    def _matt(self, scene: Scene, points: Float[Tensor, "height width 3"], on_object: ObjectLabels) -> Scene | None:
+    def _matt(
+        self,
+        scene: Scene,
+        points: Float[Tensor, "height width 3"],
+        on_object: ObjectLabels,
+        indirect: Indirect | None,
+    ) -> Scene | None:
         """Return the photos without highlights; None where they are as good as they are."""
         if scene.ground_known:
-            return without_highlights(scene, points, on_object, self._bounce(scene, points))
+            return without_highlights(scene, points, on_object, indirect or self._bounce(scene, points))
         material = material_without_ground(scene, points, on_object)
         return None if material is None else matt_photos(scene, points, on_object, material)
 
@@ -135,12 +152,20 @@ class Observer:
         scene = self._with_powers(scene, points, normals)
         read = partial(self._appearance, surface, scene, points, normals)
         first = self._solved(surface, scene, *read(self._bounce(scene, points)))
-        interreflection = photo_interreflection(first, scene) if scene.ground_known and self._relief is None else None
-        scale = 0.0 if interreflection is None else true_scale(first, scene, interreflection)
-        if interreflection is None or scale == 0:
+        scale, indirect = self._between_surfaces(first, scene)
+        if indirect is None:
             return first
-        albedo, gloss = read(lambda at, facing: scale * interreflection.at(at, facing))
+        albedo, gloss = read(indirect)
         return replace(first, albedo=albedo, gloss=gloss, interreflection=scale)
+
+    def _between_surfaces(self, solved: Fields, scene: Scene) -> tuple[float, Indirect | None]:
+        """Return the true scale of the albedo, and the light between surfaces; 0 and None where none shows."""
+        known = scene.ground_known and self._relief is None
+        interreflection = photo_interreflection(solved, scene) if known else None
+        scale = 0.0 if interreflection is None else true_scale(solved, scene, interreflection)
+        if interreflection is None or scale == 0:
+            return 0.0, None
+        return scale, lambda at, facing: scale * interreflection.at(at, facing)
 
     def _solved(
         self, surface: SdfGrid, scene: Scene, albedo: Float[Tensor, "height width 3"], gloss: Gloss | None
@@ -170,7 +195,14 @@ class Observer:
         """Estimate the albedo of object and ground, and the object's gloss."""
         assert self._ground is not None
         albedo, gloss = surface_appearance(scene, surface, points, normals, indirect)
-        return torch.where((normals != 0).any(-1, keepdim=True), albedo, self._ground.albedo), gloss
+        return self._beside_ground(albedo, normals), gloss
+
+    def _beside_ground(
+        self, albedo: Float[Tensor, "height width 3"], normals: Float[Tensor, "height width 3"]
+    ) -> Float[Tensor, "height width 3"]:
+        """Return the albedo of the object where a surface is seen, and of the ground elsewhere."""
+        assert self._ground is not None
+        return torch.where((normals != 0).any(-1, keepdim=True), albedo, self._ground.albedo)
 
     def _beside_relief(self, labels: Labels, surface: SdfGrid | None) -> Labels:
         """Drop the labels in shadows that uneven ground casts on itself: they are not the object's."""

@@ -1,12 +1,14 @@
 """Normals, albedo and shadow labels of the object: robust photometric stereo under near lights, pixel by pixel."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from reconstruct.appearance.lobe_fit import Indirect, from_endless_ground
 from reconstruct.labels.ground_test import GroundTest
 from reconstruct.labels.outline import dilated, local_mean
 from reconstruct.scene import Scene, grey_irradiance, grey_of
@@ -14,6 +16,8 @@ from reconstruct.shading.joint_normals import Picture, fit_together
 from reconstruct.shading.noise import DEFAULT_NOISE, Noise
 from reconstruct.shading.normal_fit import MODEL_SHARE, Pixels, Prior, fit_normals, indirect_light, misfit
 from reconstruct.shading.normal_kernels import INDIRECT_SHARE
+
+Beyond = Callable[[Tensor], Tensor]  # of pixels: the light between surfaces in each photo less an endless ground's
 
 CHUNK = 8192  # pixels at once: 40 photos of them stay near the processor
 DARKER_DOUBT = 1.0  # log ratio to the neighbours' albedo at which a darker fit is no longer trusted
@@ -53,18 +57,22 @@ def label_object(
     normals: Float[Tensor, "height width 3"] | None,
     mask: Float[Tensor, "height width"],
     ground: GroundTest | None = None,
+    indirect: Indirect | None = None,
 ) -> ObjectLabels:
     """Estimate normals, albedo and shadow labels of the pixels with mask > 0.5, given approximate surface points.
 
     Solves I_k = albedo (E_k max(n . l_k, 0) V_k + indirect) for albedo * n with weights that shrink for outliers:
     shadows are too dark, highlights too bright. The indirect light is ambient plus the bounce of the lit ground,
-    albedo_ground * E_ground * (1 - n_z) / 2, the form factor of an infinite plane, scaled to the observed shadows.
+    albedo_ground * E_ground * (1 - n_z) / 2, the form factor of an infinite plane, scaled to the observed shadows. Of a
+    surface that is known, light between its parts and the ground comes in place of the plane's [Nayar, Ikeuchi and
+    Kanade, Shape from interreflections, IJCV 1991], whose form factor then tells how it changes with the normal.
 
     Args:
         points: world, the current surface; used where mask > 0.5.
         normals: the current surface's, world, where known (0 elsewhere): the prior of each pixel's normal, which
             decides where the photos are too few.
         ground: gives the noise and the light reflected by the ground; without it neither is known.
+        indirect: irradiance of surface points by all that object and ground reflect; None: by an endless ground alone.
 
     Raises:
         ValueError: the scene has shadow pictures only.
@@ -78,11 +86,13 @@ def label_object(
     noise = DEFAULT_NOISE if ground is None else ground.noise
     places = torch.nonzero(where)
     scaled = ground_light(scene, points, where, ground)
-    usual = _usual_albedo(scene, points, where, scaled, noise)
+    gather = partial(_gather, scene, points, bounce=scaled, noise=noise)
+    if indirect is not None and normals is not None:
+        gather = partial(gather, beyond=partial(_beyond_endless_ground, points, normals, indirect, scaled))
+    usual = _usual_albedo(where, gather)
     solved, inliers, errors = torch.zeros(len(places), 3), torch.zeros(len(places)), torch.zeros(len(places))
     for part, own in _chunks(places):
-        row, column = part.unbind(1)
-        pixels = _gather(scene, points, part, scaled, noise)
+        pixels, (row, column) = gather(part), part.unbind(1)
         guess = None if normals is None else normals[row, column]
         solved[own], weight = fit_normals(pixels, Prior(usual[row, column], guess))
         inliers[own], errors[own] = weight.sum(1), misfit(pixels, solved[own])
@@ -90,7 +100,7 @@ def label_object(
         _write(labels, scene, part, pixels, solved[own], weight, trust)
     few = (inliers < FEWEST_INLIERS).float().mean() > OFTEN_FEW and len(places) * len(scene.lights) < MOST_SAMPLES
     if few:
-        _write_together(labels, scene, places, _gather(scene, points, places, scaled, noise), normals, solved, inliers)
+        _write_together(labels, scene, places, gather(places), normals, solved, inliers)
     share = torch.where(dilated(~where, 3), EDGE_SHARE, 1.0)
     if not few:
         share[tuple(places.T)] *= _explained(errors)
@@ -182,7 +192,10 @@ def _blank(scene: Scene) -> ObjectLabels:
     )
 
 
-def _gather(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, noise: Noise) -> Pixels:
+def _gather(
+    scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, noise: Noise, beyond: Beyond | None = None
+) -> Pixels:
+    """Return the samples of some pixels; `beyond` is the light between surfaces beyond the ground's bounce there."""
     assert scene.rgb is not None
     row, column = places.unbind(1)
     towards, strength = grey_irradiance(scene, points[row, column])
@@ -192,9 +205,22 @@ def _gather(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, noise:
         towards=towards.transpose(0, 1).contiguous(),
         strength=strength.T.contiguous(),
         bounce=bounce,
-        ambient=float(scene.ambient.mean()),
+        ambient=float(scene.ambient.mean()) + (0.0 if beyond is None else beyond(places)),
         noise=noise,
     )
+
+
+def _beyond_endless_ground(
+    points: Tensor, normals: Tensor, indirect: Indirect, bounce: Tensor, places: Int[Tensor, "n 2"]
+) -> Float[Tensor, "n photos"]:
+    """Return the light between surfaces less what an endless ground would send; 0 where there is no surface."""
+    row, column = places.unbind(1)
+    at, facing = points[row, column], normals[row, column]
+    known = (facing != 0).any(-1)
+    out = torch.zeros(len(places), len(bounce))
+    at, facing = at[known], facing[known]
+    out[known] = (indirect(at, facing) - from_endless_ground(bounce)(at, facing)).mean(-1).T
+    return out
 
 
 def ground_light(
@@ -310,15 +336,13 @@ def _bounce_scale(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, 
     return float(seen.median().clamp(0, 2)) if len(seen) > 50 else 0.0
 
 
-def _usual_albedo(
-    scene: Scene, points: Tensor, where: Bool[Tensor, "height width"], bounce: Tensor, noise: Noise
-) -> Float[Tensor, "height width"]:
+def _usual_albedo(where: Bool[Tensor, "height width"], gather: Callable[[Tensor], Pixels]) -> Tensor:
     """Return the local mean albedo of well-lit pixels: the probable albedo of a badly lit pixel there."""
     places = torch.nonzero(where)[::USUAL_STEP]
     logs, weights = torch.zeros(where.shape), torch.zeros(where.shape)
     for part in places.split(CHUNK):
         row, column = part.unbind(1)
-        solved, weight = fit_normals(_gather(scene, points, part, bounce, noise))
+        solved, weight = fit_normals(gather(part))
         logs[row, column] = torch.linalg.vector_norm(solved, dim=-1).clamp(min=1e-6).log()
         weights[row, column] = weight.sum(1) ** 2
     extent = places.max(0).values - places.min(0).values
