@@ -28,8 +28,8 @@ IN_THE_AIR = 2.0  # voxels above the ground
 FEW_LIGHTS = 10  # fewer leave the depth of some parts open
 NOT_LAID = "how the object was turned is not known"
 MOSTLY_GUESSED = 0.65  # of the vertices: with one camera, a third to a half is seen only in shadows or not at all
-UNDERSIDE = 0.1  # of the area, unheld and facing down: .06 at most on round bodies and animals, .12 to .27 under seats
-FACES_DOWN = -0.7  # z of a normal: within 45 degrees of straight down
+UNDERSIDE = 0.1  # of the area, unheld and facing down: .06 at most on animals, .12 to .24 under seats and tables
+FACES_DOWN = -0.9  # z of a normal: within 26 degrees of straight down, so that no round belly counts
 
 
 def summary(
