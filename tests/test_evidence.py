@@ -13,7 +13,7 @@ from test_solver import SMALL, Listener
 from reconstruct.fields import as_stored, load_fields, save_fields
 from reconstruct.mesh.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence, volume_sigma
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
-from reconstruct.run.report_json import guessed
+from reconstruct.run.report_json import guessed, undersides
 from reconstruct.scene import light_share
 from reconstruct.solve.solver import fit
 
@@ -145,3 +145,17 @@ def test_a_surface_that_is_mostly_guessed_is_warned_of():
         assert len(guessed(mesh)) == warnings
     assert "80 %" in guessed(mesh)[0]
     assert guessed(trimesh.creation.icosphere(1)) == []
+
+
+def test_undersides_that_nothing_holds_are_warned_of_and_the_base_is_none(solved):
+    fields = solved[0]
+    plate = trimesh.creation.box((100, 100, 10)).apply_translation((0, 0, fields.ground_height + 80))
+    leg = trimesh.creation.box((30, 30, 75)).apply_translation((0, 0, fields.ground_height + 37.5))
+    for parts, warnings in (((plate, leg), 1), ((leg,), 0)):
+        mesh = trimesh.util.concatenate(parts).subdivide().subdivide()
+        mesh.vertex_attributes["evidence"] = np.where(
+            mesh.vertices[:, 2] > fields.ground_height + 78, SEEN, UNCONSTRAINED
+        )
+        assert len(undersides(mesh, fields)) == warnings
+        mesh.vertex_attributes["evidence"] = np.full(len(mesh.vertices), SEEN)
+        assert undersides(mesh, fields) == []

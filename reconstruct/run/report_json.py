@@ -28,6 +28,8 @@ IN_THE_AIR = 2.0  # voxels above the ground
 FEW_LIGHTS = 10  # fewer leave the depth of some parts open
 NOT_LAID = "how the object was turned is not known"
 MOSTLY_GUESSED = 0.65  # of the vertices: with one camera, a third to a half is seen only in shadows or not at all
+UNDERSIDE = 0.1  # of the area, unheld and facing down: .06 at most on animals, .12 to .24 under seats and tables
+FACES_DOWN = -0.9  # z of a normal: within 26 degrees of straight down, so that no round belly counts
 
 
 def summary(
@@ -68,6 +70,7 @@ def summary(
             *misfit(_last_numbers(run)),
             *pieces(mesh, solved),
             *guessed(mesh),
+            *undersides(mesh, solved),
             *_requests(run),
             *(f"{x.photo}: {x.reason}" for one in views.values() for x in one.lights if x.used and x.reason),
         ],
@@ -246,6 +249,27 @@ def guessed(mesh: trimesh.Trimesh) -> list[str]:
     return [
         f"{100 * unheld['share']:.0f} % of the surface is held by neither photos nor edges of shadows: a smooth guess. "
         "Light from more sides, low and from behind the object, holds more of it."
+    ]
+
+
+def undersides(mesh: trimesh.Trimesh, solved: "Fields") -> list[str]:
+    """Return a warning if a large part of the surface faces the ground and has no evidence; the base does not count.
+
+    What the edge of a seat or a table's top shades hangs in shadow under every light, however far it hangs down.
+    """
+    if "evidence" not in mesh.vertex_attributes:
+        return []
+    from reconstruct.mesh.evidence import UNCONSTRAINED
+
+    unheld = (np.asarray(mesh.vertex_attributes["evidence"]).ravel() == UNCONSTRAINED)[mesh.faces].all(1)
+    floor = max(solved.ground_height, float(mesh.bounds[0, 2])) + IN_THE_AIR * solved.grid.spacing
+    hangs = unheld & (mesh.face_normals[:, 2] < FACES_DOWN) & (mesh.triangles_center[:, 2] > floor)
+    share = mesh.area_faces[hangs].sum() / mesh.area
+    if share <= UNDERSIDE:
+        return []
+    return [
+        f"{100 * share:.0f} % of the surface are undersides that neither photos nor edges of shadows hold: how far "
+        "they hang down is a guess. Lower lights and a lower camera, or photos of the object on its side, would tell."
     ]
 
 

@@ -263,7 +263,7 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, tup
         said = {"message": verdict.sentence(), "numbers": {}, "surface": None}
         task.report(stage="solve", done=first + level.iterations, total=total, **said)
     if state.level == 0 and len(config.levels) > 1:
-        found = without_unsupported_matter(found, placed(lit_from(scenes, shift)), rays, config)
+        found = without_unsupported_matter(found, placed(lit_from(scenes, shift)), rays)
     after = _fresh(state.level + 1, found, shift, state.began_with)
     return replace(after, left_out=state.left_out, verdict=verdict), rays
 

@@ -1,11 +1,9 @@
-"""Mean curvature flow of the hidden surface: it removes unseen matter that no ray supports.
+"""Mean curvature flow of the hidden surface between two bounds: it removes unseen matter that no ray needs.
 
-Behind an object there is space that the camera does not see, and whose shadow falls outside its view, too. No ray
-needs matter there, and no ray proves it empty. Of all surfaces that agree with the rays, this finds a tight one.
+Behind and below an object there is space that the camera does not see, and whose shadow falls outside its view or into
+the shadow of what it does see. No ray needs matter there, and no ray proves it empty. Of all surfaces that agree with
+the rays, this finds a tight one.
 """
-
-from collections.abc import Sequence
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,7 +12,6 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from torch import Tensor
 
-from reconstruct.config import FitConfig
 from reconstruct.labels.supervision import DARK_ENOUGH, SURE_ENOUGH, Supervision
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
@@ -22,35 +19,40 @@ from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import redistanced
 from reconstruct.sdf.rays import first_hits, lights_to_grid, to_grid, visibility
-from reconstruct.solve.ray_counts import FEWEST_RAYS, ray_counts
 from reconstruct.views import Scenes, each
 
 STABLE_STEP = 1 / 6  # voxels^2: explicit steps of the flow are stable up to here
-STEPS = 120  # bulges up to a radius of 2 sqrt(STEPS * STABLE_STEP) = 9 voxels vanish; larger ones become lower
-CHECK_EVERY = 10  # steps: in that time at most a bulge of one voxel vanishes and has to be restored
-ROUNDS = 4  # of restoring matter after a check
-SEEN_SHELL = 3  # voxels about what the camera sees: known without shadows
+STEPS = 200  # at most: bulges up to a radius of 2 sqrt(STEPS * STABLE_STEP) = 12 voxels vanish, larger ones sink
+CHECK_EVERY = 10  # steps after which phi becomes a distance again
+AT_REST = 0.05  # voxels of movement in so many steps: the flow ends
+SEEN_SHELL = 1  # voxels about what the camera sees: known without shadows
 SLIVER = 2  # px: wider is no sliver, see _slivers
-EDGE_SHELL = 1  # voxels about where dark rays at the edges of shadows pass: matter is there
+EXPLAINED = 1.0  # voxels beside seen matter at which a ray may pass and needs no other: a coarse edge is off by as much
 NEAR = 3.0  # voxels about the surface in which it moves
 SHARPNESS = 8.0  # NeuS s per voxel: a ray that passes a tenth of a voxel inside counts as blocked
-STEP_ALONG = 0.5  # voxels, of the search for the matter that blocked a ray
+STEP_ALONG = 0.5  # voxels, of the search for the matter that blocks a ray; rays that start closer together are one
+TOUCHED = 0.5  # voxels: a ray that passes the matter farther away is blocked by none
 AIR = 0.5  # voxels: on the walls of the box, where matter would stick, the surface closes half a voxel inside
-LEAST_MATTER = 1.0  # voxels: radius of the matter restored for a ray
+LEAST_MATTER = 1.0  # voxels: radius of the matter that is kept for a ray
+STANDING = 3  # nodes above the ground: what is needed there stands on it
 
 Voxels = Float[np.ndarray, "nx ny nz"]
 Nodes = Bool[np.ndarray, "nx ny nz"]
+Rays = tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]
 
 
 def without_unsupported_matter(
-    surface: SdfGrid, scenes: Scene | Scenes, rays: Supervision | tuple[Supervision, ...], config: FitConfig
+    surface: SdfGrid, scenes: Scene | Scenes, rays: Supervision | tuple[Supervision, ...]
 ) -> SdfGrid:
-    """Remove unseen matter that no ray supports; dark shadow rays that were blocked stay blocked.
+    """Remove unseen matter that no ray needs; dark shadow rays that were blocked stay blocked.
 
-    Mean curvature flow, d phi / dt = Laplacian phi, makes a ball of radius r vanish in a time r^2 / 4 and leaves a flat
-    wall unchanged. The surface is fixed near what a camera sees and where dark rays touch it; a lit ray that touches
-    it only bounds the matter. If the flow would free a dark ray, matter is restored, and fixed, where the ray
-    passes closest to the remaining matter. On the ground the surface stands upright.
+    Mean curvature flow, d phi / dt = Laplacian phi, between two bounds. phi does not fall: lit rays bound the matter
+    from outside, and nothing is added. phi does not rise where a dark ray needs matter: each that passes no matter
+    that a camera sees keeps what lies about the deepest point of its way. So the hidden surface spans the places that
+    shadows hold as a soap film does. What a camera sees stands still. On the ground the surface stands upright.
+
+    A dark ray says that matter is somewhere on its way, not where. Rays that pass the edge of a table's top below a
+    light at 15 degrees run along a cone under the top: the top explains them, and they hold no cone.
 
     Args:
         scenes: of all cameras, with the lights that the surface was solved under; world frame.
@@ -66,16 +68,19 @@ def without_unsupported_matter(
     phi = _as_distance(phi)
     before, low = phi.copy(), _first_above(surface, scenes[0].ground_height)
     seen = [_seen(surface, scene, own) for scene, own in zip(scenes, rays, strict=True)]
-    fixed = np.logical_or.reduce([shell for _, shell in seen])
-    dark = tuple(replace(own, confidence=own.confidence * (own.label < DARK_ENOUGH)) for own in rays)
-    edges = ray_counts(scenes, dark, surface, config).numpy() > FEWEST_RAYS
-    fixed |= walls | ndimage.binary_dilation(edges, iterations=EDGE_SHELL)
+    shell = np.logical_or.reduce([near for _, near in seen])
     views = zip(scenes, rays, seen, strict=True)
-    guard = _Guard(_as_grid(before, surface), [_dark_rays(scene, own, at) for scene, own, (at, _) in views], fixed)
+    dark = [_dark_rays(scene, own, at, surface.spacing) for scene, own, (at, _) in views]
+    most = _kept(before, surface, shell & (before < 0), dark, low)
+    fixed, last = shell | walls, before
     for step in range(STEPS):
         _tighten(phi, fixed, low)
+        np.clip(phi, before, most, out=phi)
         if (step + 1) % CHECK_EVERY == 0:
-            phi = _as_distance(guard.given_back(phi, fixed))
+            phi = _as_distance(phi)
+            if np.abs(phi - last)[np.abs(last) < 1].max(initial=0) < AT_REST:
+                break
+            last = phi.copy()
     return _as_grid(phi, surface)
 
 
@@ -148,56 +153,51 @@ def _slivers(
     return found.flat[rays.pixels]
 
 
-def _dark_rays(
-    scene: Scene, rays: Supervision, points: Float[np.ndarray, "pixels 3"]
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
-    """Return the start and the light, world, of a view's surely dark shadow rays from points that its pixels see."""
+def _dark_rays(scene: Scene, rays: Supervision, points: Float[np.ndarray, "pixels 3"], spacing: float) -> Rays:
+    """Return the start and the light, world, of a view's surely dark shadow rays from points that its pixels see.
+
+    Of rays to one light that start within STEP_ALONG voxels of each other, one stays.
+    """
     dark = (rays.label < DARK_ENOUGH) & (rays.confidence > SURE_ENOUGH) & (rays.role != kernels.EDGE)
     photo, pixel = np.nonzero(dark & np.isfinite(points[:, 0]))
-    return torch.from_numpy(points[pixel]).float(), scene.lights[torch.from_numpy(photo)]
+    places = np.rint(points[pixel] / (STEP_ALONG * spacing)).astype(np.int64)
+    _, first = np.unique(np.c_[photo, places], axis=0, return_index=True)
+    return torch.from_numpy(points[pixel[first]]).float(), scene.lights[torch.from_numpy(photo[first])]
 
 
-class _Guard:
-    """The dark shadow rays that only movable matter blocks, and the surface that blocked them."""
+def _kept(phi: Voxels, like: SdfGrid, seen: Nodes, dark: list[Rays], low: int) -> Voxels:
+    """Return the largest phi that leaves the matter which dark rays need: NEAR or more where none needs any.
 
-    def __init__(self, before: SdfGrid, dark: Sequence[tuple[Tensor, Tensor]], fixed: Nodes):
-        self._before, self._phi = before, _in_voxels(before)
-        self._starts, self._lights = (torch.cat(parts) for parts in zip(*dark, strict=True))
-        self._keep(self._free(np.where(fixed, self._phi, np.float32(NEAR))))
-        self._keep(~self._free(self._phi))
+    Args:
+        seen: nodes of matter that a camera sees: rays that pass them need no other.
+        low: the first layer of nodes above the ground.
+    """
+    starts, lights = (torch.cat(parts).contiguous() for parts in zip(*dark, strict=True))
+    alone = _as_grid((_away(seen) - EXPLAINED).astype(np.float32), like)
+    needy = visibility(alone, starts, lights, SHARPNESS / like.spacing) > DARK_ENOUGH
+    needed = np.zeros(phi.shape, bool)
+    needed[tuple(_deepest(phi, like, (starts[needy], lights[needy])).T)] = True
+    foot = needed[:, :, low : low + STANDING]
+    foot[...] = np.flip(np.maximum.accumulate(np.flip(foot, 2), 2), 2)
+    return np.maximum(_away(needed) - LEAST_MATTER, phi).astype(np.float32)
 
-    def _keep(self, chosen: Bool[np.ndarray, " rays"]) -> None:
-        which = torch.from_numpy(chosen)
-        self._starts, self._lights = self._starts[which].contiguous(), self._lights[which].contiguous()
 
-    def _free(self, phi: Voxels) -> Bool[np.ndarray, " rays"]:
-        """Return which of the rays reach their light."""
-        grid = _as_grid(phi, self._before)
-        return visibility(grid, self._starts, self._lights, SHARPNESS / grid.spacing).numpy() > DARK_ENOUGH
+def _away(nodes: Nodes) -> Voxels:
+    """Return the distance to the nearest of some nodes, voxels; everywhere large if there are none."""
+    if not nodes.any():
+        return np.full(nodes.shape, float(sum(nodes.shape)))
+    return np.asarray(ndimage.distance_transform_edt(~nodes))
 
-    def given_back(self, phi: Voxels, fixed: Nodes) -> Voxels:
-        """Return phi with matter restored where rays became free, and add that matter to `fixed` in place."""
-        for _ in range(ROUNDS):
-            places = self._closest(phi, self._free(phi))
-            if not len(places):
-                break
-            missing = np.ones(phi.shape, bool)
-            missing[tuple(places.T)] = False
-            away = np.asarray(ndimage.distance_transform_edt(missing)) - LEAST_MATTER
-            phi = np.minimum(phi, np.maximum(away, self._phi)).astype(np.float32)
-            fixed |= away < LEAST_MATTER
-        return np.ascontiguousarray(phi)
 
-    def _closest(self, phi: Voxels, free: Bool[np.ndarray, " rays"]) -> Int[np.ndarray, "n 3"]:
-        """Return, for each freed ray, the node closest to the remaining matter among those that blocked it before."""
-        which = torch.from_numpy(free)
-        starts, lights = to_grid(self._before, self._starts[which]), lights_to_grid(self._before, self._lights[which])
-        towards = lights[:, :3] - lights[:, 3:] * starts
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        best, places = np.full(len(starts), np.inf), np.zeros((len(starts), 3))
-        for t in np.arange(0, np.linalg.norm(phi.shape), STEP_ALONG):
-            at = starts + t * towards
-            was, now = (ndimage.map_coordinates(f, at.T, order=1, cval=np.inf) for f in (self._phi, phi))
-            nearer = (was < 0) & (now < best)
-            best[nearer], places[nearer] = now[nearer], at[nearer]
-        return np.unique(np.rint(places[np.isfinite(best)]).astype(int), axis=0)
+def _deepest(phi: Voxels, like: SdfGrid, rays: Rays) -> Int[np.ndarray, "nodes 3"]:
+    """Return the nodes at the deepest points of rays that touch matter."""
+    starts, lights = to_grid(like, rays[0]), lights_to_grid(like, rays[1])
+    towards = lights[:, :3] - lights[:, 3:] * starts
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    least, places = np.full(len(starts), TOUCHED), np.full((len(starts), 3), np.nan)
+    for t in np.arange(0, np.linalg.norm(phi.shape), STEP_ALONG):
+        at = starts + t * towards
+        now = ndimage.map_coordinates(phi, at.T, order=1, cval=np.inf)
+        deeper = now < least
+        least[deeper], places[deeper] = now[deeper], at[deeper]
+    return np.unique(np.rint(places[np.isfinite(places[:, 0])]).astype(int), axis=0)
