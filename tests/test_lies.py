@@ -191,13 +191,27 @@ def test_lights_of_another_lie_move_in_its_own_world(laid):
 
 def test_a_motion_a_little_off_is_refined_on_rays_and_held_out_rays_agree(laid, own_rays):
     scene, motion = laid
-    rays = LieRays((scene,), (own_rays,))
+    rays = LieRays((replace(scene, light_sigma=torch.full_like(scene.light_sigma, 0.5)),), (own_rays,))
     about, surface = np.array([5.0, 0.0, 30.0]), grid_of(SHAPES)
     start = stepped(motion, np.array([0.05, -0.04, 0.05, 1.5, -1.2, 1.0]), about)
     found = refined_motion(start, surface, rays, about, 40.0)
-    before, after = off(start, motion), off(found, motion)
+    before, after = off(start, motion), off(found[0], motion)
     assert after[0] < 0.5 * before[0] and after[1] < 0.5 * before[1]
-    assert compare(rays, surface, start, found).is_kept and not compare(rays, surface, found, start).is_kept
+    assert compare(surface, (start, rays), found).is_kept and not compare(surface, found, (start, rays)).is_kept
+
+
+def test_lights_that_are_all_too_high_pull_a_motion_less_where_they_may_be(laid, own_rays):
+    scene, motion = laid
+    about, surface = np.array([5.0, 0.0, 30.0]), grid_of(SHAPES)
+    high = replace(scene, lights=scene.lights + torch.tensor([0.0, 0.0, 40.0, 0.0]))  # mm, of 500
+    found = []
+    for sigma in (0.0, 20.0):
+        doubted = replace(high, light_sigma=torch.full_like(scene.light_sigma, sigma))
+        moved, lit = refined_motion(motion, surface, LieRays((doubted,), (own_rays,)), about, 40.0)
+        found.append((*off(moved, motion), lit.scenes[0].lights - high.lights))
+    (turn, shift, still), (less_turn, less_shift, change) = found
+    assert less_turn < 0.7 * turn and less_shift < 0.7 * shift
+    assert not still.any() and float(change[:, 2].mean()) < 0
 
 
 def test_a_refined_motion_is_kept_where_a_guessed_part_of_the_surface_hides_what_it_gains(laid, own_rays):
@@ -205,10 +219,10 @@ def test_a_refined_motion_is_kept_where_a_guessed_part_of_the_surface_hides_what
     rays, about = LieRays((scene,), (own_rays,)), np.array([5.0, 0.0, 30.0])
     start = stepped(motion, np.array([-0.01, 0.01, -0.01, -0.4, 0.3, -0.3]), about)
     guessed = grid_of((*SHAPES, Sphere((-22.0, 16.0, 20.0), 9.0, COLOUR)))
-    found = compare(rays, guessed, start, motion)
+    found = compare(guessed, (start, rays), (motion, rays))
     assert found.before < found.after and found.is_kept
     worse = stepped(motion, np.array([0.05, -0.04, 0.05, 1.5, -1.2, 1.0]), about)
-    assert not compare(rays, grid_of(SHAPES), motion, worse).is_kept
+    assert not compare(grid_of(SHAPES), (motion, rays), (worse, rays)).is_kept
 
 
 def test_a_motion_is_denied_only_by_more_than_twice_the_noise():

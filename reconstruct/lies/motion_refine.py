@@ -3,13 +3,20 @@
 The surface stands still, and all cameras and lights of the lie move together: six numbers. Residuals are the
 differences between transmittance and label of the lie's shadow rays, and between opacity and mask of its camera rays,
 with weights that fall with the difference: a ray past a part that no lie saw is wrong under every motion.
+
+Six joint motions of each scene's lights are free besides: the one that changes no shadow where the object moves along
+[Kriegman and Belhumeur 2001], common shifts and stretches. A calibration that reads the ground's shading knows these
+worst, and shadow labels that are all too wide look like them. Held still, they would turn into a motion of the lie
+towards the camera. They are unknowns of the refinement alone: the lights stay as calibrated.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.linalg import block_diag
 
 from calibration.pose import Pose
 from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out
@@ -19,6 +26,7 @@ from reconstruct.lies.rotations import stepped
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import visibility
+from reconstruct.solve.light_refine import LightShift, common_motions, lit_from, unseen_motion
 from reconstruct.views import Scenes, placed
 
 SHARPNESS = (4.0, 8.0)  # NeuS s per voxel: the first sees an edge from a voxel away
@@ -28,6 +36,8 @@ WIDTH = 0.3  # difference from which a ray counts less
 SEED = 2000  # of the rays that judge, beside the seed
 JUDGING = 0.15  # of the blocks
 SIGMAS = 2.0  # of the noise: by more a refined motion is worse
+MODES = 6  # joint motions of a scene's lights
+CORRELATED = 100.0  # rays along a shadow's edge that count as one
 GROUPS = 10_000  # more than the photos of a scene
 NUDGE = 0.05  # voxels at the object's edge, over the sharpness of 8: of the finite differences
 
@@ -60,8 +70,10 @@ class MotionTrial:
 
 def refined_motion(
     start: Pose, surface: SdfGrid, lie: LieRays, about: Float[np.ndarray, "3"], radius: float, seed: int = 0
-) -> Pose:
+) -> tuple[Pose, LieRays]:
     """Return the motion, from a start near it, under which a lie's rays agree best with a surface.
+
+    The rays are returned with it under the lights, moved together, under which they agree so.
 
     Args:
         start: object_from_lie.
@@ -69,36 +81,100 @@ def refined_motion(
         about: the object's centre there, and `radius` its size, world length: what a turn is measured with.
     """
     samples = _samples(lie, seed, is_judging=False)
-    motion = start
+    motion, middle = start, start.inverse().apply(about)
+    lights = [_JointMotions(scene, middle, np.zeros(MODES)) for scene in lie.scenes]
     for sharpness in SHARPNESS:
-        nudge = NUDGE * SHARPNESS[-1] / sharpness * surface.spacing
-        steps = nudge * np.array([1 / radius] * 3 + [1.0] * 3)
+        shift = NUDGE * SHARPNESS[-1] / sharpness * surface.spacing
+        steps = shift * np.array([1 / radius] * 3 + [1.0] * 3)
+        nudges = [own.nudges(shift / radius) for own in lights]
+        sigma = np.concatenate([np.full(6, np.inf), *(1 / own for own in nudges)])
 
-        def residuals(pose: Pose, sharpness: float = sharpness) -> Float[np.ndarray, " n"]:
-            return np.concatenate([sample.residuals(surface, pose, sharpness) for sample in samples])
+        def residuals(pose: Pose, lit: list[_JointMotions], sharpness: float = sharpness) -> Float[np.ndarray, " n"]:
+            pairs = zip(samples, lit, strict=True)
+            return np.concatenate([sample.residuals(surface, pose, sharpness, own.scene()) for sample, own in pairs])
 
         for _ in range(STEPS):
-            now, columns = residuals(motion), []
+            columns = []
             for own in np.diag(steps):
-                ahead, behind = residuals(stepped(motion, own, about)), residuals(stepped(motion, -own, about))
+                ahead, behind = (residuals(stepped(motion, sign * own, about), lights) for sign in (1, -1))
                 columns.append((ahead - behind) / 2)
-            slopes, weight = np.stack(columns, 1), 1 / (1 + (now / WIDTH) ** 2) ** 2
-            normal = (slopes * weight[:, None]).T @ slopes
-            normal += 1e-9 * np.diag(np.diag(normal)) + 1e-12 * np.eye(6)
-            motion = stepped(motion, -steps * np.linalg.solve(normal, (slopes * weight[:, None]).T @ now), about)
-    return motion
+            each = zip(samples, lights, nudges, strict=True)
+            of_lights = [sample.light_slopes(surface, motion, sharpness, own, nudge) for sample, own, nudge in each]
+            slopes = np.concatenate([np.stack(columns, 1), block_diag(*of_lights)], 1)
+            at = np.concatenate([np.zeros(6), *(own.amounts / by for own, by in zip(lights, nudges, strict=True))])
+            step = _least_squares(slopes, residuals(motion, lights), at, sigma)
+            motion = stepped(motion, steps * step[:6], about)
+            changes = np.concatenate(nudges) * step[6:]
+            lights = [own.changed(by) for own, by in zip(lights, changes.reshape(-1, MODES), strict=True)]
+    return motion, replace(lie, scenes=tuple(own.scene() for own in lights))
 
 
-def compare(lie: LieRays, surface: SdfGrid, before: Pose, after: Pose, seed: int = 0) -> MotionTrial:
-    """Judge two motions by rays that refined_motion did not use, on a surface to which this lie has not contributed."""
-    samples, errors = _samples(lie, seed, is_judging=True), []
-    for motion in (before, after):
-        off = np.concatenate([sample.residuals(surface, motion, SHARPNESS[-1]) for sample in samples])
+def _least_squares(
+    slopes: Float[np.ndarray, "n unknowns"],
+    now: Float[np.ndarray, " n"],
+    at: Float[np.ndarray, " unknowns"],
+    sigma: Float[np.ndarray, " unknowns"],
+) -> Float[np.ndarray, " unknowns"]:
+    """Return the step that makes the residuals least, with weights that fall with the residual.
+
+    Args:
+        at: the unknowns, whose prior is 0 with one `sigma` (inf: none); CORRELATED rays count as one.
+    """
+    weight = 1 / (1 + (now / WIDTH) ** 2) ** 2
+    normal = (slopes * weight[:, None]).T @ slopes
+    prior = CORRELATED * float((weight * now**2).sum() / weight.sum()) / sigma**2
+    normal += np.diag(prior) + 1e-9 * np.diag(np.diag(normal)) + 1e-12 * np.eye(len(normal))
+    return -np.linalg.solve(normal, (slopes * weight[:, None]).T @ now + prior * at)
+
+
+def compare(surface: SdfGrid, before: tuple[Pose, LieRays], after: tuple[Pose, LieRays], seed: int = 0) -> MotionTrial:
+    """Judge two motions by rays that refined_motion did not use, on a surface to which this lie has not contributed.
+
+    Args:
+        before, after: each motion with the same lie's rays, under the lights that go with it.
+    """
+    errors, groups = [], []
+    for motion, lie in (before, after):
+        samples = _samples(lie, seed, is_judging=True)
+        pairs = zip(samples, lie.scenes, strict=True)
+        off = np.concatenate([sample.residuals(surface, motion, SHARPNESS[-1], scene) for sample, scene in pairs])
         square = (off / WIDTH) ** 2
         errors.append(square / (1 + square))
-    groups = np.unique(np.concatenate([sample.groups(k) for k, sample in enumerate(samples)]), return_inverse=True)[1]
-    _, noise = mean_difference(errors[1], errors[0], groups)
+        groups.append(np.concatenate([sample.groups(k) for k, sample in enumerate(samples)]))
+    of_photo = np.unique(groups[0], return_inverse=True)[1]
+    _, noise = mean_difference(errors[1], errors[0], of_photo)
     return MotionTrial(float(errors[0].mean()), float(errors[1].mean()), noise)
+
+
+@dataclass(frozen=True)
+class _JointMotions:
+    """The lights of a scene, moved together by an amount of each of six motions: sigmas of the lights, mean square."""
+
+    calibrated: Scene
+    middle: Float[np.ndarray, "3"]  # of the object, in the scene's world
+    amounts: Float[np.ndarray, "6"]
+
+    @cached_property
+    def _modes(self) -> Float[np.ndarray, "6 photos 3"]:
+        """The motions, in sigmas of the lights per unit; 0 where all lights are known."""
+        modes = np.concatenate([unseen_motion(self.calibrated)[None], common_motions(self.calibrated)])
+        return modes / np.sqrt((modes**2).sum(2).mean(1)).clip(min=1e-12)[:, None, None]
+
+    def nudges(self, turn: float) -> Float[np.ndarray, "6"]:
+        """Return the amounts that displace the light that moves most by an angle as seen from the object, rad."""
+        lights, sigma = self.calibrated.lights.double().numpy(), self.calibrated.light_sigma.double().numpy()
+        distance = np.linalg.norm(lights[:, :3] - lights[:, 3:] * self.middle, axis=1)
+        angle = np.linalg.norm(self._modes * sigma, axis=2) / distance
+        return turn / angle.max(axis=1).clip(min=1e-12)
+
+    def changed(self, by: Float[np.ndarray, "6"]) -> "_JointMotions":
+        """Return the lights moved further."""
+        return replace(self, amounts=self.amounts + by)
+
+    def scene(self) -> Scene:
+        """Return the scene under these lights."""
+        shift = np.tensordot(self.amounts, self._modes, 1)
+        return lit_from(self.calibrated, LightShift(shift, np.zeros_like(shift)))
 
 
 def _samples(lie: LieRays, seed: int, is_judging: bool) -> "list[_Sample]":
@@ -118,25 +194,50 @@ class _Sample:
         sure = np.flatnonzero(chosen & (rays.confidence > SURE_ENOUGH))
         wanted = np.zeros(rays.confidence.shape, bool)
         wanted.flat[rng.permutation(sure)[:most]] = True
-        self.scene = scene
+        self.count = len(scene.lights)
         self.shadow = hold_out(rays, wanted, with_outline=True)[1]
         seen = np.flatnonzero(chosen & (rays.mask_confidence > SURE_ENOUGH) & np.isfinite(rays.ground_t))
         self.pixels = np.sort(rng.permutation(seen)[:most])
         self.mask, self.weight = rays.mask[self.pixels], np.sqrt(rays.mask_confidence[self.pixels])
 
-    def residuals(self, surface: SdfGrid, motion: Pose, sharpness: float) -> Float[np.ndarray, " n"]:
-        """Return the weighted differences of all rays under a motion."""
-        scene = placed(replace(self.scene, object_from_world=motion))
-        directions = torch.from_numpy(motion.rotate(self.shadow.directions.double().numpy())).float()
-        shadow: HeldOut = replace(self.shadow, directions=directions)
-        shades = np.sqrt(shadow.weight) * shadow.differences(surface, scene, sharpness)
+    def residuals(self, surface: SdfGrid, motion: Pose, sharpness: float, scene: Scene) -> Float[np.ndarray, " n"]:
+        """Return the weighted differences of all rays under a motion and the scene's lights."""
+        scene, directions = self._there(motion, scene)
         which = torch.from_numpy(self.pixels)
-        ground = scene.eye + shadow.ground_t[which, None] * directions[which]
+        ground = scene.eye + self.shadow.ground_t[which, None] * directions[which]
         ends = torch.cat([ground, torch.ones(len(ground), 1)], 1)
         open_sight = visibility(surface, scene.eye.expand_as(ground).contiguous(), ends, sharpness / surface.spacing)
+        shades = self._shades(surface, sharpness, scene, directions)
         return np.concatenate([shades, self.weight * (1 - open_sight.numpy() - self.mask)])
+
+    def light_slopes(
+        self,
+        surface: SdfGrid,
+        motion: Pose,
+        sharpness: float,
+        lights: _JointMotions,
+        nudges: Float[np.ndarray, "6"],
+    ) -> Float[np.ndarray, "n 6"]:
+        """Return the change of the residuals as each joint motion of the lights grows by its nudge."""
+        columns = []
+        for own in np.diag(nudges):
+            ends = (self._there(motion, lights.changed(sign * own).scene()) for sign in (1, -1))
+            ahead, behind = (self._shades(surface, sharpness, *there) for there in ends)
+            columns.append((ahead - behind) / 2)
+        return np.pad(np.stack(columns, 1), ((0, len(self.pixels)), (0, 0)))  # a camera ray knows no light
+
+    def _there(self, motion: Pose, scene: Scene) -> tuple[Scene, Float[torch.Tensor, "pixels 3"]]:
+        """Return the scene in the surface's frame, and the rays of its pixels."""
+        directions = torch.from_numpy(motion.rotate(self.shadow.directions.double().numpy())).float()
+        return placed(replace(scene, object_from_world=motion)), directions
+
+    def _shades(
+        self, surface: SdfGrid, sharpness: float, scene: Scene, directions: Float[torch.Tensor, "pixels 3"]
+    ) -> Float[np.ndarray, " rays"]:
+        shadow: HeldOut = replace(self.shadow, directions=directions)
+        return np.sqrt(shadow.weight) * shadow.differences(surface, scene, sharpness)
 
     def groups(self, number: int) -> Int[np.ndarray, " n"]:
         """Return a number for each residual: that of its photo, or one for all camera rays of the scene `number`."""
-        first, count = number * GROUPS, len(self.scene.lights)
+        first, count = number * GROUPS, self.count
         return first + np.concatenate([self.shadow.photo, np.full(len(self.pixels), count)])

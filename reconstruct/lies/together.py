@@ -140,8 +140,8 @@ def motion_on_rays(
 ) -> tuple[Pose, MotionTrial]:
     """Refine a lie's motion on its rays against the surface of the others, unless held-out rays deny it."""
     refined = refined_motion(start, others, lie.rays, start.apply(seen.points.mean(0)), seen.size / 2, seed)
-    trial = compare(lie.rays, others, start, refined, seed)
-    return refined if trial.is_kept else start, trial
+    trial = compare(others, (start, lie.rays), refined, seed)
+    return refined[0] if trial.is_kept else start, trial
 
 
 def _union(surfaces: list[tuple[SeenSurface, Pose]], merged: SdfGrid) -> SeenSurface:
