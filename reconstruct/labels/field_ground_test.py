@@ -34,7 +34,8 @@ from reconstruct.shading.noise import Noise
 
 EXPLAINED = 0.7  # of the picture: a light model that makes ground of so much needs no other
 GAINED = 0.2  # of the picture: how much more of it the field must make ground
-QUIETER = 0.75  # of the field's noise on lit ground: a model with less knows the light
+POWERS_OFF = 0.05  # log units: a model that is less off on the ground near the object knows the light
+SAMPLES = 4000  # pixels near the object that tell it
 FOLLOWS = 0.5  # share of the photos from which a pixel counts as ground of the field
 LIT, DARK = 0.7, 0.25  # visibility above and below which ground is called lit and in shadow
 GREY_CONFIDENCE = 0.3  # between them, where no shadow's edge runs through
@@ -53,8 +54,9 @@ AMBIENT_SHARE = 0.7  # of the light in shadows on the ground: the rest comes fro
 def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     """Classify pixels as object or ground, and label the shadows on it: by the lights' model, or by a field of light.
 
-    The field is used where the model makes much less of the picture ground than the field does, unless the model
-    explains all that lies before the table's edge.
+    The field is used where the model makes much less of the picture ground than the field does. Where both explain what
+    lies before the ground's end, the photos' powers decide, see _powers_off: how quiet the fits are is no evidence,
+    since the field bends to what it is fitted to, and so do the model's gains.
 
     Args:
         before: of the same photos under other lights; what does not depend on them is taken from it.
@@ -77,12 +79,32 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
         return tested
     field = at_photo_size(fit_ground_field(rgb, usable, beyond), rgb, usable)
     by_model = tested if beyond is None else test_ground(scene, _without_object(field, beyond))
-    if tested.explained >= EXPLAINED:
-        return by_model
-    if by_model.explained >= EXPLAINED and by_model.noise.share < QUIETER * field.noise():
-        return by_model  # it explains all of the table, and better
     share = float((field.follows > FOLLOWS).mean())
-    return _by_field(scene, field) if share > tested.explained + GAINED else by_model
+    if by_model.explained >= EXPLAINED:
+        use_field = share >= EXPLAINED and _powers_off(scene, field, by_model) > POWERS_OFF
+    else:
+        use_field = share > tested.explained + GAINED
+    return _by_field(scene, field) if use_field else by_model
+
+
+def _powers_off(scene: Scene, field: GroundField, tested: GroundTest) -> float:
+    """Return how far the model's lights are off in brightness: root mean square over photos, log units.
+
+    For each photo the median, over lit ground near the object, of the field's light less that of the model. The model
+    was fitted to the whole ground with a fixed beam and tone curve; what it misses here of the photo's brightness it
+    misses on the object, whose normals come out wrong by it, while with the field each photo's power is free.
+    """
+    near = torch.from_numpy(np.flatnonzero(_near(tested.mask.numpy() > 0.5)))
+    near = near[:: max(1, len(near) // SAMPLES)]
+    light, lit, sure = (
+        maps.reshape(len(field.light), -1)[:, near]
+        for maps in (torch.from_numpy(field.light), tested.visibility, tested.confidence)
+    )
+    ratio = light - _modelled(scene, ground_points(scene).reshape(-1, 3)[near])
+    known = (lit > LIT) & (sure > 0) & ratio.isfinite()
+    typical = torch.where(known, ratio, torch.nan).nanmedian(1).values
+    typical = typical[typical.isfinite()]
+    return float((typical - typical.median()).square().mean().sqrt()) if len(typical) else 0.0
 
 
 def _without_object(field: GroundField, beyond: Bool[np.ndarray, "height width"]) -> Bool[Tensor, "height width"]:
@@ -193,15 +215,19 @@ def _gain(
 ) -> tuple[Float[Tensor, "photos height width"], float]:
     """Return the gain of GroundTest, 1 near the object in the middle of the photos; and the field's log of albedo 1."""
     light = torch.from_numpy(field.light)
-    points = ground_points(scene).reshape(-1, 3)
+    ratio = light - _modelled(scene, ground_points(scene).reshape(-1, 3)).reshape(light.shape)
+    near = ratio[:, torch.from_numpy(_near(region))]
+    scale = float(near[near.isfinite()].median()) if near.isfinite().any() else 0.0
+    return (ratio - scale).nan_to_num(0.0).exp(), scale
+
+
+def _modelled(scene: Scene, points: Float[Tensor, "n 3"]) -> Float[Tensor, "photos n"]:
+    """Return the log of the lit ground's irradiance by the lights' model, ambient light included."""
     modelled = []
     for part in points.split(PIXELS_AT_ONCE):
         towards, strength = grey_irradiance(scene, part)
         modelled.append(strength * towards[..., 2].clamp(min=0) + scene.ambient.mean())
-    ratio = light - torch.cat(modelled, 1).clamp(min=1e-12).log().reshape(light.shape)
-    near = ratio[:, torch.from_numpy(_near(region))]
-    scale = float(near[near.isfinite()].median()) if near.isfinite().any() else 0.0
-    return (ratio - scale).nan_to_num(0.0).exp(), scale
+    return torch.cat(modelled, 1).clamp(min=1e-12).log()
 
 
 def _albedo(
