@@ -140,9 +140,14 @@ def before_a_wall(scene: Scene, off: float, seed: int = 0) -> Scene:
 
 
 def test_where_both_ways_explain_the_table_the_powers_decide():
-    low = (Box((-45, -45, 0), (-20, -20, 12)),)  # of the table before the wall
-    scene, _ = render(low, LOOK)
-    known, unknown = before_a_wall(scene, 0), before_a_wall(scene, 0.1)
+    """The level top of a box before a wall shades like ground: only the lights' model tells it by its height."""
+    scene, truth = render((Box((-50, -60, 0), (0, -20, 20)),), LOOK)
+    known, unknown = before_a_wall(scene, 0), before_a_wall(scene, 0.12)
     assert by_the_lights(known).explained < 0.7
-    assert label_ground(known).field is None
-    assert label_ground(unknown).field is not None
+    by_model, by_field = label_ground(known), label_ground(unknown)
+    assert by_model.field is None and by_field.field is not None
+    for found in (by_model, by_field):
+        assert overlap(found.mask.numpy() > 0.5, truth.mask) > 0.9
+        assert wrong_labels(found, truth) < 0.02
+    again = label_ground(unknown, by_field)
+    assert torch.equal(again.mask, by_field.mask) and torch.equal(again.visibility, by_field.visibility)
