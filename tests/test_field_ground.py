@@ -122,3 +122,32 @@ def test_shadows_lie_where_they_can_reach():
     assert reached[~dark].mean() < 0.9
     assert most_height(eye, outline) >= 70  # of the heap
     assert not shadow_reach(eye, outline, lights, np.full((2, 3), np.nan)).any()
+
+
+def before_a_wall(scene: Scene, off: float, seed: int = 0) -> Scene:
+    """Let another surface, lit in each photo in its own way, fill the upper part; and change the photos' powers.
+
+    Args:
+        off: log units, one sigma of what the powers are changed by.
+    """
+    assert scene.rgb is not None
+    rng = np.random.default_rng(seed)
+    light, power = rng.normal(0, 0.6, len(scene.rgb)), np.exp(rng.normal(0, off, len(scene.rgb)))
+    rgb = scene.rgb.clone()
+    wall = round(0.42 * scene.directions.shape[0])
+    rgb[:, :wall] = torch.from_numpy(0.2 * np.exp(light)).float()[:, None, None, None]
+    return replace(scene, rgb=rgb * torch.from_numpy(power).float()[:, None, None, None])
+
+
+def test_where_both_ways_explain_the_table_the_powers_decide():
+    """The level top of a box before a wall shades like ground: only the lights' model tells it by its height."""
+    scene, truth = render((Box((-50, -60, 0), (0, -20, 20)),), LOOK)
+    known, unknown = before_a_wall(scene, 0), before_a_wall(scene, 0.12)
+    assert by_the_lights(known).explained < 0.7
+    by_model, by_field = label_ground(known), label_ground(unknown)
+    assert by_model.field is None and by_field.field is not None
+    for found in (by_model, by_field):
+        assert overlap(found.mask.numpy() > 0.5, truth.mask) > 0.9
+        assert wrong_labels(found, truth) < 0.02
+    again = label_ground(unknown, by_field)
+    assert torch.equal(again.mask, by_field.mask) and torch.equal(again.visibility, by_field.visibility)
