@@ -19,7 +19,7 @@ from reconstruct.initialization.light_contradictions import contradictions
 from reconstruct.initialization.normal_integration import BIAS, LIT_BIAS, follow_normals
 from reconstruct.initialization.shading_start import heights_from_shading
 from reconstruct.initialization.shadow_hull import LIGHTS_PER_NEED, carved
-from reconstruct.labels.held_out import draw_blocks, hold_out, without
+from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out, without
 from reconstruct.labels.labels import Labels, not_isolated
 from reconstruct.labels.multiple_lights import is_shared
 from reconstruct.labels.observer import Observer
@@ -281,6 +281,7 @@ class HeightStart:
 
     def __init__(self, scene: Scene, observer: Observer, config: FitConfig, say: Say):
         self._scene, self._observer, self._say = scene, observer, say
+        self._judge: tuple[SdfGrid, Scene, HeldOut] | None = None  # see labels
         self._nodes = min(MOST_NODES, round(NODES_PER_PIXEL * max(scene.camera.width, scene.camera.height)))
         level = Level(self._nodes, ITERATIONS, RATE, config.levels[-1].blur)
         self.config = replace(config, levels=(level,), sharpness=SHARPNESS, curvature=CURVATURE)
@@ -299,9 +300,12 @@ class HeightStart:
         return (scene if scene.ground_known else replace(scene, ground_height=base_of(start)),)
 
     def labels(self, surface: SdfGrid, scenes: Scenes) -> tuple[Labels, ...]:
-        """Return the labels without those of the held-out rays."""
+        """Return the labels without those of the held-out rays, which `better` is to ask if this is its start."""
         (scene,) = scenes
-        return (without(self._with_isolated_pixels(self._observer.labels(surface, scene)), self._drawn()),)
+        labels = self._with_isolated_pixels(self._observer.labels(surface, scene))
+        if self._judge is None:
+            self._judge = (surface, scene, self._held_out(scene, labels))
+        return (without(labels, self._drawn()),)
 
     def shaped(self, surface: SdfGrid, scenes: Scenes, labels: tuple[Labels, ...]) -> SdfGrid:
         """Return the surface unchanged: its depths were solved jointly."""
@@ -310,9 +314,20 @@ class HeightStart:
     def better(self, start: SdfGrid, found: SdfGrid, scenes: Scenes) -> SdfGrid:
         """Return the free surface, unless the height field explains the held-out rays better."""
         (scene,) = scenes
-        rays = supervise(scene, self._with_isolated_pixels(self._observer.labels(start, scene)))
-        _, held_out = hold_out(rays, self._drawn()[:, rays.pixels], with_outline=True)
+        held_out, self._judge = self._judge_of(start, scene), None
         return min((start, found), key=lambda grid: held_out.error(grid, scene, JUDGES_SHARPNESS))
+
+    def _judge_of(self, start: SdfGrid, scene: Scene) -> HeldOut:
+        """Return the rays held out, by the labels of a surface: those read last time are not read again."""
+        if self._judge is not None:
+            read, under, held_out = self._judge
+            if read is start and torch.equal(under.lights, scene.lights) and under.ground_height == scene.ground_height:
+                return held_out
+        return self._held_out(scene, self._with_isolated_pixels(self._observer.labels(start, scene)))
+
+    def _held_out(self, scene: Scene, labels: Labels) -> HeldOut:
+        rays = supervise(scene, labels)
+        return hold_out(rays, self._drawn()[:, rays.pixels], with_outline=True)[1]
 
     def doubts(self, scenes: Scenes) -> tuple[str, ...]:
         """Return nothing: without bare ground no light's shadow can be judged by itself."""
