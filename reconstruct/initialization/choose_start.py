@@ -18,7 +18,7 @@ from reconstruct.initialization.hull_front import on_front
 from reconstruct.initialization.light_contradictions import contradictions
 from reconstruct.initialization.normal_integration import BIAS, LIT_BIAS, follow_normals
 from reconstruct.initialization.shading_start import heights_from_shading
-from reconstruct.initialization.shadow_hull import LIGHTS_PER_NEED, carved
+from reconstruct.initialization.shadow_hull import LIGHTS_PER_NEED, GroundMaps, carved
 from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out, without
 from reconstruct.labels.labels import Labels, not_isolated
 from reconstruct.labels.multiple_lights import is_shared
@@ -157,6 +157,7 @@ class HullStart:
 
     def __init__(self, scenes: Scenes, observers: tuple[Observer, ...], config: FitConfig, say: Say, name: str = HULL):
         self._scenes, self._observers, self.config, self._say = scenes, observers, config, say
+        self._doubts: tuple[str, ...] | None = None  # of lights that cannot move
         self.name = name  # LIT_HULL if the normals of shadow pictures made it better: surface() decides
 
     def surface(self, show: Show = lambda _: None) -> SdfGrid:
@@ -170,6 +171,9 @@ class HullStart:
         views = list(zip(self._scenes, self._observers, strict=True))
         if len(views) > 1:
             return hull
+        scene, _ = views[0]
+        if scene.ground_depth is None and not (bool(scene.light_sigma.any()) or is_shared(scene)):
+            self._doubts = _doubts(scene, ground_labels[0], found.maps)  # these maps are made once
         return self._bent(hull, resampled(found.space, nodes).grid(), *views[0])
 
     def _bent(self, hull: SdfGrid, space: SdfGrid, scene: Scene, observer: Observer) -> SdfGrid:
@@ -243,11 +247,16 @@ class HullStart:
         """Return the contradictions between the shadows on the ground in a view; uneven ground is not judged."""
         if scenes[0].ground_depth is not None:
             return ()
-        views, said = zip(scenes, self._observers, strict=True), []
-        for scene, observer in views:
-            of = f"{scene.view}: " if scene.view else ""
-            said += [of + doubt for doubt in contradictions(scene, observer.ground_labels()).sentences()]
-        return tuple(said)
+        if self._doubts is not None:
+            return self._doubts
+        views = zip(scenes, self._observers, strict=True)
+        return tuple(said for scene, observer in views for said in _doubts(scene, observer.ground_labels()))
+
+
+def _doubts(scene: Scene, labels: Labels, maps: GroundMaps | None = None) -> tuple[str, ...]:
+    """Return the contradictions between the shadows on the ground in one view, see `contradictions`."""
+    of = f"{scene.view}: " if scene.view else ""
+    return tuple(of + doubt for doubt in contradictions(scene, labels, maps).sentences())
 
 
 def _bias(scene: Scene) -> float:
