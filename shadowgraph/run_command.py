@@ -8,6 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from reconstruct.run_folder.folder import RunFolder
+from shadowgraph.loading import loading
 from shadowgraph.options import Calibrate, Check, Run, settings_of
 from shadowgraph.terminal import Display, page, print_lines
 
@@ -28,8 +29,9 @@ def run_stages(command: Calibrate, console: Console) -> None:
     Raises:
         UserError: the input, a setting or the machine cannot be used.
     """
-    from reconstruct.source.options import RunOptions
-    from reconstruct.source.source import open_source
+    with loading():
+        from reconstruct.source.options import RunOptions
+        from reconstruct.source.source import open_source
 
     known = {f.name for f in fields(RunOptions)}
     options = RunOptions(**{k: v for k, v in settings_of(command).items() if k in known})
@@ -41,8 +43,8 @@ def run_stages(command: Calibrate, console: Console) -> None:
         with display.beating(opening := f"opening {command.capture}"):
             with console.status(opening):
                 source = open_source(command.capture, options)
-                from reconstruct.run import pipeline  # after the refusals, which need none of what it imports
-
+                with loading():
+                    from reconstruct.run import pipeline  # after the refusals, which need none of what it imports
                 pipeline.refuse_device(options)
             with RunFolder(out, display, display.activity) as run:
                 pipeline.claim(source, options, run, stages, command.force)

@@ -68,6 +68,18 @@ def test_help_and_refusals_do_not_wait_for_torch():
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
 
 
+def test_what_imports_make_is_no_garbage_and_the_collector_goes_on():
+    code = (
+        "import gc, shadowgraph.loading\n"
+        "with shadowgraph.loading.loading():\n"
+        "    import rich.console\n"
+        "    assert not gc.isenabled()\n"
+        "print(gc.isenabled(), gc.get_freeze_count() > 1000)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=600)
+    assert done.stdout.split() == ["True", "True"], done.stderr
+
+
 @pytest.mark.parametrize("given", [None, "ACTIVE"])
 def test_threads_of_other_libraries_wait_asleep_unless_the_user_said_otherwise(given):
     environment = {key: value for key, value in os.environ.items() if key != "OMP_WAIT_POLICY"}

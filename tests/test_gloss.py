@@ -14,6 +14,7 @@ from reconstruct.appearance.brdf import LOBES, Material, facing_reflectance, met
 from reconstruct.appearance.lobe_fit import Indirect, Samples, _non_negative, fit_lobes, from_endless_ground
 from reconstruct.fields import Fields, load_fields, save_fields
 from reconstruct.labels.highlights import (
+    lit_pixels,
     material_without_ground,
     matt_photos,
     surface_appearance,
@@ -53,7 +54,8 @@ def dark(scene: Scene) -> Indirect:
 def solved(scene: Scene, truth: Truth) -> Fields:
     """The true surface with the material read from the photos."""
     normals = tensor(truth.normals * truth.mask[..., None])
-    albedo, gloss = surface_appearance(scene, ball_grid(), tensor(truth.points), normals, dark(scene))
+    lit = lit_pixels(scene, ball_grid(), tensor(truth.points), normals)
+    albedo, gloss = surface_appearance(scene, tensor(truth.points), normals, lit, dark(scene))
     albedo = torch.where(torch.from_numpy(truth.mask)[..., None], albedo, tensor(truth.albedo))
     pose = truth.calibration.world_from_camera
     return Fields(ball_grid(), albedo, truth.calibration.camera, pose, 0.0, "mm", gloss=gloss)
@@ -176,7 +178,8 @@ def test_gloss_is_that_of_the_part_that_shines():
     half = replace(shiny, rgb=torch.where(left[..., None], shiny.rgb, scene.rgb), usable=shiny.usable | ~left)
     nowhere = SdfGrid(torch.full((2, 2, 2), 100.0), torch.full((3,), 500.0), 1.0)
     normals = tensor(truth.normals * truth.mask[..., None])
-    _, gloss = surface_appearance(half, nowhere, tensor(truth.points), normals, dark(scene))
+    lit = lit_pixels(half, nowhere, tensor(truth.points), normals)
+    _, gloss = surface_appearance(half, tensor(truth.points), normals, lit, dark(scene))
     assert gloss is not None
     scale, on_object = gloss.weights[..., 0], torch.from_numpy(truth.mask)
     assert scale[on_object & ~left].median() < 0.2 * scale[on_object & left].median()

@@ -288,3 +288,21 @@ def test_held_out_rays_prefer_the_truth():
     assert held_out.error(ball(40.0), scene) < 0.02 < held_out.error(ball(30.0), scene)
     assert np.isfinite(find_surface(ball(40.0), scene.eye[None], scene.forward[None]).numpy()).all()
     assert isinstance(BALL, Sphere) and truth.mask.any()
+
+
+def test_the_start_is_judged_by_its_labels_that_were_read_and_by_no_others():
+    scene, _ = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=8))
+    scene = replace(scene, rgb=None, ground_known=False)
+    observer = Observer(scene)
+    start = choose_start(scene, observer, FitConfig())
+    read, labels = [], observer.labels
+    observer.labels = lambda surface, scene: read.append(surface) or labels(surface, scene)
+    first, other = (SdfGrid(torch.full((8, 8, 8), size), torch.zeros(3), 1.0) for size in (1.0, 2.0))
+    for surface in (first, other):
+        start.labels(surface, (scene,))
+    assert start.better(first, other, (scene,)) is first
+    assert read == [first, other]
+    start.labels(other, (scene,))
+    moved = replace(scene, lights=scene.lights + torch.tensor([9.0, 0, 0, 0]))
+    start.better(other, first, (moved,))
+    assert read == [first, other, other, other]

@@ -18,8 +18,8 @@ from reconstruct.initialization.hull_front import on_front
 from reconstruct.initialization.light_contradictions import contradictions
 from reconstruct.initialization.normal_integration import BIAS, LIT_BIAS, follow_normals
 from reconstruct.initialization.shading_start import heights_from_shading
-from reconstruct.initialization.shadow_hull import LIGHTS_PER_NEED, carved
-from reconstruct.labels.held_out import draw_blocks, hold_out, without
+from reconstruct.initialization.shadow_hull import LIGHTS_PER_NEED, GroundMaps, carved
+from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out, without
 from reconstruct.labels.labels import Labels, not_isolated
 from reconstruct.labels.multiple_lights import is_shared
 from reconstruct.labels.observer import Observer
@@ -157,6 +157,7 @@ class HullStart:
 
     def __init__(self, scenes: Scenes, observers: tuple[Observer, ...], config: FitConfig, say: Say, name: str = HULL):
         self._scenes, self._observers, self.config, self._say = scenes, observers, config, say
+        self._doubts: tuple[str, ...] | None = None  # of lights that cannot move
         self.name = name  # LIT_HULL if the normals of shadow pictures made it better: surface() decides
 
     def surface(self, show: Show = lambda _: None) -> SdfGrid:
@@ -170,6 +171,9 @@ class HullStart:
         views = list(zip(self._scenes, self._observers, strict=True))
         if len(views) > 1:
             return hull
+        scene, _ = views[0]
+        if scene.ground_depth is None and not (bool(scene.light_sigma.any()) or is_shared(scene)):
+            self._doubts = _doubts(scene, ground_labels[0], found.maps)  # these maps are made once
         return self._bent(hull, resampled(found.space, nodes).grid(), *views[0])
 
     def _bent(self, hull: SdfGrid, space: SdfGrid, scene: Scene, observer: Observer) -> SdfGrid:
@@ -243,11 +247,16 @@ class HullStart:
         """Return the contradictions between the shadows on the ground in a view; uneven ground is not judged."""
         if scenes[0].ground_depth is not None:
             return ()
-        views, said = zip(scenes, self._observers, strict=True), []
-        for scene, observer in views:
-            of = f"{scene.view}: " if scene.view else ""
-            said += [of + doubt for doubt in contradictions(scene, observer.ground_labels()).sentences()]
-        return tuple(said)
+        if self._doubts is not None:
+            return self._doubts
+        views = zip(scenes, self._observers, strict=True)
+        return tuple(said for scene, observer in views for said in _doubts(scene, observer.ground_labels()))
+
+
+def _doubts(scene: Scene, labels: Labels, maps: GroundMaps | None = None) -> tuple[str, ...]:
+    """Return the contradictions between the shadows on the ground in one view, see `contradictions`."""
+    of = f"{scene.view}: " if scene.view else ""
+    return tuple(of + doubt for doubt in contradictions(scene, labels, maps).sentences())
 
 
 def _bias(scene: Scene) -> float:
@@ -281,6 +290,7 @@ class HeightStart:
 
     def __init__(self, scene: Scene, observer: Observer, config: FitConfig, say: Say):
         self._scene, self._observer, self._say = scene, observer, say
+        self._judge: tuple[SdfGrid, Scene, HeldOut] | None = None  # see labels
         self._nodes = min(MOST_NODES, round(NODES_PER_PIXEL * max(scene.camera.width, scene.camera.height)))
         level = Level(self._nodes, ITERATIONS, RATE, config.levels[-1].blur)
         self.config = replace(config, levels=(level,), sharpness=SHARPNESS, curvature=CURVATURE)
@@ -299,9 +309,12 @@ class HeightStart:
         return (scene if scene.ground_known else replace(scene, ground_height=base_of(start)),)
 
     def labels(self, surface: SdfGrid, scenes: Scenes) -> tuple[Labels, ...]:
-        """Return the labels without those of the held-out rays."""
+        """Return the labels without those of the held-out rays, which `better` is to ask if this is its start."""
         (scene,) = scenes
-        return (without(self._with_isolated_pixels(self._observer.labels(surface, scene)), self._drawn()),)
+        labels = self._with_isolated_pixels(self._observer.labels(surface, scene))
+        if self._judge is None:
+            self._judge = (surface, scene, self._held_out(scene, labels))
+        return (without(labels, self._drawn()),)
 
     def shaped(self, surface: SdfGrid, scenes: Scenes, labels: tuple[Labels, ...]) -> SdfGrid:
         """Return the surface unchanged: its depths were solved jointly."""
@@ -310,9 +323,20 @@ class HeightStart:
     def better(self, start: SdfGrid, found: SdfGrid, scenes: Scenes) -> SdfGrid:
         """Return the free surface, unless the height field explains the held-out rays better."""
         (scene,) = scenes
-        rays = supervise(scene, self._with_isolated_pixels(self._observer.labels(start, scene)))
-        _, held_out = hold_out(rays, self._drawn()[:, rays.pixels], with_outline=True)
+        held_out, self._judge = self._judge_of(start, scene), None
         return min((start, found), key=lambda grid: held_out.error(grid, scene, JUDGES_SHARPNESS))
+
+    def _judge_of(self, start: SdfGrid, scene: Scene) -> HeldOut:
+        """Return the rays held out, by the labels of a surface: those read last time are not read again."""
+        if self._judge is not None:
+            read, under, held_out = self._judge
+            if read is start and torch.equal(under.lights, scene.lights) and under.ground_height == scene.ground_height:
+                return held_out
+        return self._held_out(scene, self._with_isolated_pixels(self._observer.labels(start, scene)))
+
+    def _held_out(self, scene: Scene, labels: Labels) -> HeldOut:
+        rays = supervise(scene, labels)
+        return hold_out(rays, self._drawn()[:, rays.pixels], with_outline=True)[1]
 
     def doubts(self, scenes: Scenes) -> tuple[str, ...]:
         """Return nothing: without bare ground no light's shadow can be judged by itself."""

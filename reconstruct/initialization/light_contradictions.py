@@ -16,6 +16,7 @@ from scipy.ndimage import map_coordinates
 
 from reconstruct.initialization.shadow_hull import GroundMaps, hull_maps
 from reconstruct.labels.labels import Labels
+from reconstruct.labels.uneven_ground import near_ground
 from reconstruct.scene import Scene
 
 SAMPLES = 150  # dark ground points asked of each light
@@ -81,16 +82,17 @@ class Contradictions:
         return tuple(said)
 
 
-def contradictions(scene: Scene, labels: Labels) -> Contradictions:
+def contradictions(scene: Scene, labels: Labels, maps: GroundMaps | None = None) -> Contradictions:
     """Return how much of each light's shadow on the ground the shadow hull of the others cannot cast.
 
     Args:
         labels: of the ground, before there is a surface.
+        maps: of this scene and these labels, if they are known.
 
     Raises:
         ReconstructionError: no object (see shadow_hull).
     """
-    maps, (points,) = hull_maps((scene,), (labels,))
+    points, maps = near_ground(scene), maps or hull_maps((scene,), (labels,))[0]
     beside = cv2.distanceTransform((labels.mask < 0.5).numpy().astype(np.uint8), cv2.DIST_L2, 5)
     ground = ((labels.mask < 0.5) & (labels.mask_confidence > SURE)).numpy() & np.isfinite(points[..., 0])
     dark = ((labels.visibility < DARK) & (labels.confidence > SURE)).numpy() & ground

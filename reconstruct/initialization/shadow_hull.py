@@ -102,6 +102,7 @@ class Hull:
 
     grid: SdfGrid
     space: SdfGrid
+    maps: GroundMaps  # that carved it
 
 
 def carve_grid(
@@ -153,7 +154,7 @@ def carve_grid(
     kept = without_specks(inside & with_support(keep))
     values[inside & ~without_floating(kept, above < STANDING * spacing, rays)] = 0.5 * spacing
     grids = [SdfGrid(torch.from_numpy(x), torch.from_numpy(lower).float(), spacing) for x in (values, space)]
-    return Hull(*grids)
+    return Hull(*grids, maps)
 
 
 def _carve_from_the_side(values: np.ndarray, views: Sequence[SideView], lower: np.ndarray, spacing: float) -> None:

@@ -114,47 +114,56 @@ def _open_samples(
     return replace(samples, weight=scene.usable[:, pixels[0], pixels[1]].T.float())
 
 
-def surface_appearance(
+def lit_pixels(
     scene: Scene,
     grid: SdfGrid,
     points: Float[Tensor, "height width 3"],
     normals: Float[Tensor, "height width 3"],
+) -> Bool[Tensor, "photos n"]:
+    """Return in which photos no shadow falls on each pixel that sees the surface (normal not 0), in their order."""
+    parts = [torch.zeros(len(scene.lights), 0, dtype=torch.bool)]
+    for pixels in _blocks((normals != 0).any(-1), len(scene.lights)):
+        at = points[pixels]
+        starts = shadow_starts(grid, at, normals[pixels], torch.ones(len(at), dtype=torch.bool))
+        parts.append(unshadowed(grid, starts, scene.lights) > SURELY_LIT)
+    return torch.cat(parts, 1)
+
+
+def surface_appearance(
+    scene: Scene,
+    points: Float[Tensor, "height width 3"],
+    normals: Float[Tensor, "height width 3"],
+    lit: Bool[Tensor, "photos n"],
     indirect: Indirect,
 ) -> tuple[Float[Tensor, "height width 3"], Gloss | None]:
     """Estimate albedo and gloss of the pixels that see the surface (normal not 0), with its own normals and shadows.
 
     The same surface under the same lights then reproduces the photos. Gloss is None for matt objects.
+
+    Args:
+        lit: see lit_pixels.
     """
     where = (normals != 0).any(-1)
     row, column = torch.nonzero(where).unbind(1)
+
+    def samples(pixels: tuple[Tensor, Tensor], reached: Bool[Tensor, "photos m"]) -> Samples:
+        return gather(scene, points[pixels], normals[pixels], pixels, reached.float(), indirect)
+
     step = max(1, len(row) // ENOUGH_PIXELS)
     some = row[::step], column[::step]
-    thinned = _lit_samples(scene, grid, points, normals, some, indirect)
+    thinned = samples(some, lit[:, ::step])
     lobes = fit_lobes(thinned)
     usual = torch.zeros(where.shape)
     usual[where] = usual_scale(thinned, lobes, points[some], points[where])
     albedo, scale, known = torch.zeros_like(points), torch.zeros(where.shape), torch.zeros_like(where)
+    done = 0
     for pixels in _blocks(where, len(scene.lights)):
-        samples = _lit_samples(scene, grid, points, normals, pixels, indirect)
-        albedo[pixels], scale[pixels] = point_materials(samples, lobes, usual[pixels])
-        known[pixels] = samples.weight.sum(1) >= FEWEST_LIT
+        own = samples(pixels, lit[:, done : done + len(pixels[0])])
+        done += len(pixels[0])
+        albedo[pixels], scale[pixels] = point_materials(own, lobes, usual[pixels])
+        known[pixels] = own.weight.sum(1) >= FEWEST_LIT
     albedo, scale = _filled(albedo, known, where), _filled(scale[..., None], known, where)
     return albedo, Gloss(lobes.coefficients[None], scale) if lobes.coefficients.any() else None
-
-
-def _lit_samples(
-    scene: Scene,
-    grid: SdfGrid,
-    points: Float[Tensor, "height width 3"],
-    normals: Float[Tensor, "height width 3"],
-    pixels: tuple[Tensor, Tensor],
-    indirect: Indirect,
-) -> Samples:
-    """Return the samples that the surface does not shadow."""
-    at, facing = points[pixels], normals[pixels]
-    starts = shadow_starts(grid, at, facing, torch.ones(len(at), dtype=torch.bool))
-    lit = (unshadowed(grid, starts, scene.lights) > SURELY_LIT).float()
-    return gather(scene, at, facing, pixels, lit, indirect)
 
 
 def _blocks(where: Bool[Tensor, "height width"], photos: int) -> Iterator[tuple[Tensor, Tensor]]:

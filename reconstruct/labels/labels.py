@@ -43,14 +43,16 @@ def assemble_labels(scene: Scene, ground: GroundTest | None, object_labels: Obje
     """
     if ground is None:
         return _from_shadow_pictures(scene)
-    visibility, confidence = ground.visibility * (ground.confidence > 0), ground.confidence
+    confidence = ground.confidence
+    visibility = torch.where(confidence > 0, ground.visibility, 0.0)
     height, width = ground.mask.shape
     normals, normal_confidence = torch.zeros(height, width, 3), torch.zeros(height, width)
     albedo = ground.albedo
     if object_labels is not None:
         trusted = object_labels.confidence * ground.mask_confidence  # in the gap at a contact it may be ground
-        visibility = torch.where(trusted > 0, object_labels.visibility, visibility)
-        confidence = torch.maximum(trusted, confidence * (trusted == 0))
+        is_object = trusted > 0
+        visibility = torch.where(is_object, object_labels.visibility, visibility)
+        confidence = torch.where(is_object, trusted, confidence)
         normals = object_labels.normals
         normal_confidence = object_labels.normal_confidence * ground.mask_confidence
         albedo = torch.where((object_labels.albedo > 0).any(-1, keepdim=True), object_labels.albedo, albedo)

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -15,6 +15,7 @@ from reconstruct.fields import Fields
 from reconstruct.labels.field_ground_test import label_ground
 from reconstruct.labels.ground_test import GroundTest, no_ground, test_ground, tests_alike
 from reconstruct.labels.highlights import (
+    lit_pixels,
     material_without_ground,
     matt_photos,
     surface_appearance,
@@ -150,7 +151,7 @@ class Observer:
         if is_shared(scene):
             scene = split_on_surface(scene, surface, points, normals, self._ground)
         scene = self._with_powers(scene, points, normals)
-        read = partial(self._appearance, surface, scene, points, normals)
+        read = partial(self._appearance, scene, points, normals, lit_pixels(scene, surface, points, normals))
         first = self._solved(surface, scene, *read(self._bounce(scene, points)))
         scale, indirect = self._between_surfaces(first, scene)
         if indirect is None:
@@ -186,15 +187,15 @@ class Observer:
 
     def _appearance(
         self,
-        surface: SdfGrid,
         scene: Scene,
         points: Float[Tensor, "height width 3"],
         normals: Float[Tensor, "height width 3"],
+        lit: Bool[Tensor, "photos n"],
         indirect: Indirect,
     ) -> tuple[Float[Tensor, "height width 3"], Gloss | None]:
         """Estimate the albedo of object and ground, and the object's gloss."""
         assert self._ground is not None
-        albedo, gloss = surface_appearance(scene, surface, points, normals, indirect)
+        albedo, gloss = surface_appearance(scene, points, normals, lit, indirect)
         return self._beside_ground(albedo, normals), gloss
 
     def _beside_ground(
