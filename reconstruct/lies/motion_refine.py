@@ -133,15 +133,14 @@ def compare(surface: SdfGrid, before: tuple[Pose, LieRays], after: tuple[Pose, L
     Args:
         before, after: each motion with the same lie's rays, under the lights that go with it.
     """
-    errors, groups = [], []
+    samples, errors = _samples(before[1], seed, is_judging=True), []  # the same rays under either lights
     for motion, lie in (before, after):
-        samples = _samples(lie, seed, is_judging=True)
         pairs = zip(samples, lie.scenes, strict=True)
         off = np.concatenate([sample.residuals(surface, motion, SHARPNESS[-1], scene) for sample, scene in pairs])
         square = (off / WIDTH) ** 2
         errors.append(square / (1 + square))
-        groups.append(np.concatenate([sample.groups(k) for k, sample in enumerate(samples)]))
-    of_photo = np.unique(groups[0], return_inverse=True)[1]
+    groups = np.concatenate([sample.groups(k) for k, sample in enumerate(samples)])
+    of_photo = np.unique(groups, return_inverse=True)[1]
     _, noise = mean_difference(errors[1], errors[0], of_photo)
     return MotionTrial(float(errors[0].mean()), float(errors[1].mean()), noise)
 
