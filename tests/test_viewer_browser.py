@@ -121,8 +121,9 @@ def test_surroundings_light_the_picture_also_those_that_a_visitor_brings(finishe
         return computed()
 
     lamp = computed()
-    overcast = changes(lambda: choose(tab, "Light", "Surroundings"))
-    assert (overcast == 0).mean() < (lamp == 0).mean() or overcast.mean() > lamp.mean(), "no side is in the dark"
+    changes(lambda: choose(tab, "Light", "Surroundings"))
+    # no side is in the dark; finer pictures of the lamp may still come
+    wait_until(tab, lambda: (computed() == 0).mean() < (lamp == 0).mean() or computed().mean() > 1.02 * lamp.mean())
 
     def warmth() -> float:
         picture = computed()

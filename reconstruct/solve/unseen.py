@@ -165,7 +165,7 @@ def _dark_rays(scene: Scene, rays: Supervision, points: Float[np.ndarray, "pixel
     return torch.from_numpy(points[pixel[first]]).float(), scene.lights[torch.from_numpy(photo[first])]
 
 
-def _kept(phi: Voxels, like: SdfGrid, seen: Nodes, dark: list[Rays], low: int) -> Voxels:
+def _kept(phi: Voxels, like: SdfGrid, seen: Nodes, dark: list[tuple[Tensor, Tensor]], low: int) -> Voxels:
     """Return the largest phi that leaves the matter which dark rays need: NEAR or more where none needs any.
 
     Args:
