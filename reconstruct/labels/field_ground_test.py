@@ -71,7 +71,7 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
         ValueError: the scene has no photos (scene.rgb is None).
     """
     if before is not None and before.field is not None:
-        return _by_field(scene, before.field, (before.mask, before.mask_confidence))
+        return _by_field(scene, before.field, _bare(before.field), (before.mask, before.mask_confidence))
     if is_shared(scene):
         return test_ground(split_on_ground(scene))
     tested = test_ground(scene, None if before is None else before.background)
@@ -87,10 +87,15 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     by_model = tested if beyond is None else test_ground(scene, _without_object(field, beyond))
     share = float((field.follows > FOLLOWS).mean())
     if by_model.explained < EXPLAINED:
-        return _by_field(scene, field) if share > tested.explained + GAINED else by_model
+        return _by_field(scene, field, _bare(field)) if share > tested.explained + GAINED else by_model
     if share < EXPLAINED or _powers_off(scene, field, by_model) < POWERS_OFF:
         return by_model
-    return _by_field(scene, field, _without_gaps(scene, by_model, field))
+    bare = _bare(field)
+    return _by_field(scene, field, bare, _without_gaps(scene, by_model, bare))
+
+
+def _bare(field: GroundField) -> BareGround:
+    return without_gaps(field, find_shadows(field))
 
 
 def _powers_off(scene: Scene, field: GroundField, tested: GroundTest) -> float:
@@ -118,7 +123,7 @@ def _without_object(field: GroundField, beyond: Bool[np.ndarray, "height width"]
     return torch.from_numpy(beyond & ~find_shadows(field).object_mask)
 
 
-def _without_gaps(scene: Scene, by_model: GroundTest, field: GroundField) -> Outline:
+def _without_gaps(scene: Scene, by_model: GroundTest, bare: BareGround) -> Outline:
     """Return the outline of the lights' model, with the gaps at contacts cut out that the field shows.
 
     The model tells the object's level tops from the ground by their height, which no field does. In a gap it misses the
@@ -126,18 +131,17 @@ def _without_gaps(scene: Scene, by_model: GroundTest, field: GroundField) -> Out
     """
     if scene.mask is not None:
         return by_model.mask, by_model.mask_confidence
-    bare = without_gaps(field, find_shadows(field))
     gap = torch.from_numpy((bare.gap_likelihood > GAP) & ~bare.shadows.object_mask) & (by_model.mask > 0.5)
     return torch.where(gap, 0.0, by_model.mask), torch.where(gap, GAP_CONFIDENCE, by_model.mask_confidence)
 
 
-def _by_field(scene: Scene, field: GroundField, outline: Outline | None = None) -> GroundTest:
+def _by_field(scene: Scene, field: GroundField, bare: BareGround, outline: Outline | None = None) -> GroundTest:
     """Return what the field of light says of the photos.
 
     Args:
+        bare: what of the picture is ground in this field.
         outline: the object's, where it is known already.
     """
-    bare = without_gaps(field, find_shadows(field))
     mask, mask_confidence = _mask(scene, bare) if outline is None else outline
     region = mask.numpy() > 0.5
     points = ground_points(scene).double().numpy()
