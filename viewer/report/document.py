@@ -42,6 +42,8 @@ td.n,th.n{text-align:right;white-space:nowrap}.legend{margin:.5rem 0 1rem}
 .key i{width:18px;height:3px;border-radius:2px;display:inline-block}
 ul{margin:.2rem 0;padding-left:1.2rem}code{font-size:.88em;overflow-wrap:anywhere}
 summary{cursor:pointer;color:var(--muted)}
+@media (max-width:560px){table.words tr{display:block;padding:8px 0;border-bottom:1px solid var(--line)}
+table.words th{display:none}table.words td{display:block;padding:0;border:0}table.words td:first-child{font-weight:600}}
 @media print{body{background:#fff}section,header{break-inside:avoid}}
 """
 
@@ -89,7 +91,7 @@ def facts(values: Sequence[tuple[str, str]]) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = ()) -> str:
-    """Return a table of text. The columns `numbers` are set flush right."""
+    """Return a table of text. The columns `numbers` are set flush right; without any, narrow pages stack its cells."""
     if not rows:
         return ""
 
@@ -98,7 +100,13 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[
 
     lines = ["".join(cell("th", i, words) for i, words in enumerate(head))]
     lines += ["".join(cell("td", i, words) for i, words in enumerate(r)) for r in rows]
-    return f'<div class="scroll"><table>{"".join(f"<tr>{line}</tr>" for line in lines)}</table></div>'
+    kind = "" if numbers else ' class="words"'
+    return f'<div class="scroll"><table{kind}>{"".join(f"<tr>{line}</tr>" for line in lines)}</table></div>'
+
+
+def length_unit(unit: str) -> str:
+    """Return how lengths of a world are named: `mm`, or `units` where no length is known."""
+    return "mm" if unit == "mm" else "units"
 
 
 def bullets(lines: Sequence[str]) -> str:

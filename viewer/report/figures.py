@@ -10,6 +10,7 @@ from calibration.calibration import Calibration
 from calibration.light import Light
 from reconstruct.check.light_coverage import directions, widest_gap
 from reconstruct.check.readiness import WIDE_GAP
+from viewer.report import document as doc
 
 CURVE_COLOURS = ("#d9820f", "#2f7be0", "#2e9d69", "#c8427b", "#7d5fd3", "#6b7483", "#119aa8", "#cf4f22")
 SIGMAS_SHOWN = 2.0
@@ -83,7 +84,7 @@ def lights_from_above(
     parts.append(text(x, y + 20, "camera"))
     length = _round_length(0.5 * half)
     parts.append(f'<path d="M14 {size - 14}h{length * scale:.1f}" stroke="var(--text)" stroke-width="2"/>')
-    parts.append(text(14, size - 20, f"{length:g} {'mm' if calibration.unit == 'mm' else 'units'}", "start"))
+    parts.append(text(14, size - 20, f"{length:g} {doc.length_unit(calibration.unit)}", "start"))
     return svg(size, size, parts, "Lights, camera and object from above")
 
 

@@ -51,7 +51,7 @@ def calibration_part(calibration: Calibration | None) -> str:
         return ""
     camera, sigma = calibration.camera, dict(calibration.camera.sigmas)
     height = float(calibration.world_from_camera.translation[2] - calibration.ground_height)
-    unit = "mm" if calibration.unit == "mm" else "units"
+    unit = doc.length_unit(calibration.unit)
 
     sigma["height"] = calibration.residuals.get("camera_height_sigma_mm", 0.0)
     bends = " ".join(f"{v:.3g}" for v in camera.distortion)
@@ -117,7 +117,7 @@ def lights_part(calibration: Calibration | None, mesh: trimesh.Trimesh | None) -
     note = f"Light came from all around; the widest gap is {degrees}°."
     if gap > WIDE_GAP:
         note = f"No light came from {degrees}° of the horizon (shaded): that side is mostly a guess. Light it, too."
-    unit = "mm" if calibration.unit == "mm" else "units"
+    unit = doc.length_unit(calibration.unit)
     above = ""
     if any(light.position is not None for light in calibration.lights):
         drawing = lights_from_above(calibration, None if mesh is None else mesh.bounds)
@@ -203,7 +203,7 @@ def refinement_part(report: Mapping[str, Any], calibration: Calibration | None, 
 def _table(rows: Sequence[Mapping[str, Any]], unit: str) -> str:
     """One line per light; directions in degrees."""
     is_point = any("position" in row for row in rows)
-    name = ("mm" if unit == "mm" else "units") if is_point else "degrees"
+    name = doc.length_unit(unit) if is_point else "degrees"
     scale = 1.0 if is_point else float(np.degrees(1))
     cells = [
         (

@@ -106,20 +106,22 @@ def mesh_pictures(mesh: trimesh.Trimesh, calibration: Calibration | None) -> str
     return doc.row(views[0], f"<div>{views[1]}{views[2]}</div>", kind="wide-first")
 
 
-def maps_part(maps: HasMaps | None) -> str:
+def maps_part(maps: HasMaps | None, calibration: Calibration | None) -> str:
     """Return the part about depth and normals as the camera sees them."""
     if maps is None or not maps.mask.any():
         return ""
     rows, columns = np.flatnonzero(maps.mask.any(1)), np.flatnonzero(maps.mask.any(0))
     window = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     depth, normals, mask = maps.depth[window], maps.normals[window], maps.mask[window]
+    unit = doc.length_unit("mm" if calibration is None else calibration.unit)
     near, far = (float(v) for v in (depth[mask].min(), depth[mask].max()))
     return doc.section(
         "What the camera sees",
         "The finished surface from the place of the photos: how far each point is, and which way it faces.",
         doc.row(
             doc.figure(
-                reduced(depth_picture(depth, mask), MAP_WIDTH), f"Distance: {near:.4g} (yellow) to {far:.4g} (violet)"
+                reduced(depth_picture(depth, mask), MAP_WIDTH),
+                f"Distance: {near:.4g} (yellow) to {far:.4g} {unit} (violet)",
             ),
             doc.figure(
                 reduced(normal_picture(normals, mask), MAP_WIDTH),

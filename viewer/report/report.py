@@ -115,7 +115,7 @@ def report_page(results: Results) -> str:
     parts = [
         _headline(results),
         doc.section("Please note", "What may make this result worse than it looks.", doc.bullets(_remarks(results))),
-        maps_part(results.maps),
+        maps_part(results.maps, results.calibration),
         comparison_part(results.fields, results.calibration, results.thumbs),
         photos_part(results.report.get("photos", []), results.calibration, results.thumbs),
         calibration_part(results.calibration),
