@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import fake_run
 import numpy as np
@@ -408,7 +409,9 @@ def damaged(draw: random.Random, run: Path) -> str:
     if way is by_change:
         return said
     if draw.random() < 0.25 and all(_is_small_file(path) for path in _all_files(run)):
-        with suppress(OSError, ValueError, LookupError, SafetensorError):  # what is damaged cannot always be again
+        with suppress(
+            OSError, ValueError, LookupError, SafetensorError, BadZipFile
+        ):  # what is damaged cannot always be again
             said += "; " + draw.choice(WAYS)(draw, run)
     return said
 
