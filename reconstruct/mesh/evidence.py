@@ -53,8 +53,8 @@ def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Verte
     The last term, `lean`, is what lights do that are off together, which calibrated ones mostly are: an object sheared
     along the line of sight explains their shadows then (Belhumeur, Kriegman, Yuille, The bas-relief ambiguity, 1999).
     That moves a surface across itself the more it faces the camera; 0.5 is the mean over all directions. The numbers
-    were chosen on three solves of rendered captures and looked at on others (benchmarks/results_sigma.md). The scale of
-    the printed board is not included.
+    were chosen on six solves of rendered captures (benchmarks/results_sigma.md). The scale of the
+    printed board is not included.
 
     Args:
         vertices: world.
