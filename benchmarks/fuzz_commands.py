@@ -123,8 +123,8 @@ FRESH = {
     "relight --orbit": ["relight", "{run}", "--orbit", "2", "--out", "{out}/a.gif", "--width", "32"],
     "check --out": ["check", "{reference}", "--out", "{run}"],
     "run --out": ["run", "{reference}", "--out", "{run}", "--viewer", "off"],
-    "export ply": ["export", "{run}", "--format", "ply", "--out", "{out}/a.ply"],
-    "export still": ["export", "{run}", "--format", "still", "--out", "{out}/a.png", "--width", "32"],
+    "export ply": ["export", "{run}", "{out}/a.ply"],
+    "export still": ["export", "{run}", "{out}/a.png", "--format", "still", "--width", "32"],
 }
 COMMANDS: dict[str, Callable[[Path], int]] = {
     **{name: told(words) for name, words in FRESH.items() if not name.startswith("export")},

@@ -2,11 +2,12 @@
 
     python benchmarks/fuzz_runs.py [--runs 2000] [--fresh 60] [--seed 0] [--first 0] [--table FILE]
 
-The run is that of tests/damaged_runs.py: every file that a run may hold. One of its files, sometimes two, is damaged
-byte by byte or by its structure, and one command reads the folder, in a process of its own with 2 GB of memory and 20 s
-of computing: a fork of this one, which has imported what the commands import. --fresh folders more are read by command
-lines as a user types them, in new interpreters. Writes a Markdown table; exit code 1 for any traceback, signal, hang,
-flood of memory, file read or written elsewhere, and text of the folder that becomes markup.
+The runs are those of tests/damaged_runs.py: every file that a run may hold, of one view and, every third folder, of
+several views with the object laid anew. One of the files, sometimes two, is damaged byte by byte or by its structure,
+and one command reads the folder, in a process of its own with 2 GB of memory and 20 s of computing: a fork of this one,
+which has imported what the commands import. --fresh folders more are read by command lines as a user types them, in new
+interpreters. Writes a Markdown table; exit code 1 for any traceback, signal, hang, flood of memory, file read or
+written elsewhere, and text of the folder that becomes markup.
 """
 
 import contextlib
@@ -49,6 +50,7 @@ FEW_SAMPLES = 3000  # of a surface, to evaluate it
 OUTPUT = 4000  # letters of what a command says that are looked at
 WELL = ("result", "sentence")
 THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+EVERY = 3  # of so many folders one is of several views
 OFTEN = 4  # times as often as the two commands that compute most
 DRAWN = tuple(name for name in COMMANDS for _ in range(1 if name in ("report", "evaluate") else OFTEN))
 
@@ -187,6 +189,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
         _in_a_child(lambda: damaged_runs.make(work / "base"))
+        _in_a_child(lambda: damaged_runs.make_several(work / "several"))
         _in_a_child(lambda: reference_of(work, work / "base" / "heap"))
         warm_up(work)
         lighten()
@@ -240,7 +243,7 @@ class Tally:
 def _damaged_case(work: Path, number: int, draw: random.Random) -> tuple[Path, str]:
     """A damaged copy of the run, beside a file that nobody may read, and what was done to it."""
     case = work / f"case{number}"
-    shutil.copytree(work / "base" / "heap", case / "heap")
+    shutil.copytree(work / ("several" if number % EVERY == 0 else "base") / "heap", case / "heap")
     (case / "secret").write_text("{}")
     return case, damaged_runs.damaged(draw, case / "heap")
 

@@ -24,7 +24,7 @@ from calibration.calibration import Calibration, load_calibration
 from calibration.camera import Camera
 from reconstruct.evaluate.metrics import load_capture_truth
 from reconstruct.fields import load_fields
-from reconstruct.mesh.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence, volume_sigma
+from reconstruct.mesh.evidence import SEEN, SHADOW, UNCONSTRAINED, VertexEvidence, vertex_evidence, volume_sigma
 from reconstruct.sdf.measure import length_between
 from viewer.widgets.pointer import OBLIQUE
 
@@ -98,9 +98,7 @@ def measured(capture: Path, run: Path, pairs: int) -> Measured:
     above = mesh.vertices[:, 2] > ground + ABOVE
     errors = {name: off[above & (known.kind == kind)] for kind, name in NAMED.items()}
     sigmas = {name: known.sigma[above & (known.kind == kind)].astype(float) for kind, name in NAMED.items()}
-    errors["lengths"], sigmas["lengths"] = _lengths(
-        capture, run, calibration, KDTree(mesh.vertices), known.sigma, pairs
-    )
+    errors["lengths"], sigmas["lengths"] = _lengths(capture, run, calibration, KDTree(mesh.vertices), known, pairs)
     mesh.vertex_attributes |= {"evidence": known.kind, "sigma": known.sigma}
     told = volume_sigma(mesh)
     if told is not None and (volume := _volume(truth)) is not None:
@@ -149,7 +147,7 @@ def _volume(truth: trimesh.Trimesh) -> float | None:
 
 
 def _lengths(
-    capture: Path, run: Path, calibration: Calibration, tree: KDTree, sigma: np.ndarray, pairs: int
+    capture: Path, run: Path, calibration: Calibration, tree: KDTree, known: VertexEvidence, pairs: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return errors of lengths between pixels, and their stated sigmas."""
     draw = np.random.default_rng(0)
@@ -164,28 +162,55 @@ def _lengths(
     inner[1:-1, 1:-1] &= inner[:-2, 1:-1] & inner[2:, 1:-1] & inner[1:-1, :-2] & inner[1:-1, 2:]
     inner[[0, -1]] = inner[:, [0, -1]] = False
     chosen = draw.choice(np.flatnonzero(inner), (pairs, 2))
-    beside = chosen + np.rint(draw.normal(0, POINTING, chosen.shape)).astype(int)
-    beside = beside + depth.shape[1] * np.rint(draw.normal(0, POINTING, chosen.shape)).astype(int)
-    beside = np.where(np.isfinite(depth.ravel()[beside]), beside, chosen)
+    aside = draw.normal(0, POINTING, (pairs, 2, 2))
     true = _places(lens, maps["depth_mm"].astype(float), chosen)
-    found = _places(calibration.camera, depth, beside)
-    ends = []
+    found, beside = _pointed_at(calibration.camera, depth, chosen, aside)
+    ends, leans = [], []
     for end in (0, 1):
-        here = found[:, end]
+        here, middle = found[:, end], _places(calibration.camera, depth, beside[:, end])
         straight = POINTING * depth.ravel()[beside[:, end]] / calibration.camera.fx
         moves = [
-            POINTING * np.linalg.norm(_places(calibration.camera, depth, beside[:, end] + step) - here, axis=1)
+            POINTING * np.linalg.norm(_places(calibration.camera, depth, beside[:, end] + step) - middle, axis=1)
             for step in (1, -1, depth.shape[1], -depth.shape[1])
         ]
         capped = [np.minimum(np.nan_to_num(move, nan=np.inf), OBLIQUE * straight) for move in moves]
         pointing = np.sqrt(np.mean(np.square(capped), axis=0))
         nearest = tree.query(calibration.world_from_camera.apply(here))[1]
-        ends.append(np.hypot(sigma[nearest], pointing))
+        ends.append(np.hypot(known.sigma[nearest], pointing))
+        leans.append(known.lean[nearest])
     stated = [
-        length_between(a, b, (float(x), float(y))) for a, b, x, y in zip(found[:, 0], found[:, 1], *ends, strict=True)
+        length_between(a, b, (float(x), float(y)), (float(p), float(q)))
+        for a, b, x, y, p, q in zip(found[:, 0], found[:, 1], *ends, *leans, strict=True)
     ]
     error = np.array([one.value for one in stated]) - np.linalg.norm(true[:, 0] - true[:, 1], axis=1)
     return error, np.array([one.sigma for one in stated], float)
+
+
+def _pointed_at(
+    camera: Camera, depth: np.ndarray, chosen: np.ndarray, aside: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what lies behind points beside pixels, in the camera's frame, and the pixel nearest to each point.
+
+    Inverse depth is linear on a plane: between four pixels of one surface it is interpolated; else it is the nearest
+    pixel's, or the chosen one's where the object does not cover that.
+    """
+    width = depth.shape[1]
+    v, u = np.divmod(chosen, width)
+    place = np.stack([u, v], -1) + aside
+    near = np.rint(place).astype(int)
+    near = near[..., 1] * width + near[..., 0]
+    near = np.where(np.isfinite(depth.ravel()[near]), near, chosen)
+    low = np.floor(place).astype(int)
+    part = place - low
+    corners = (low[..., 1] * width + low[..., 0])[..., None] + [0, 1, width, width + 1]
+    inverse = 1 / depth.ravel()[corners]
+    weights = np.stack([(1 - part[..., 0]) * (1 - part[..., 1]), part[..., 0] * (1 - part[..., 1])], -1)
+    weights = np.concatenate([weights, np.stack([1 - part[..., 0], part[..., 0]], -1) * part[..., 1:]], -1)
+    between = (weights * inverse).sum(-1)
+    is_one = np.ptp(1 / inverse.clip(1e-12), axis=-1) <= OBLIQUE / between.clip(1e-12) / camera.fx
+    z = np.where(is_one, 1 / between.clip(1e-12), depth.ravel()[near])
+    rays = camera.unproject(place.reshape(-1, 2)).reshape(*z.shape, 3)
+    return rays / rays[..., 2:] * z[..., None], near
 
 
 def _places(camera: Camera, depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import fake_run
 import numpy as np
@@ -18,13 +19,17 @@ import torch
 from fuzz_images import DAMAGES
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from scipy.spatial.transform import Rotation
 from strange_runs import STRANGE, by_change
 
-from calibration.calibration import save_calibration
+from calibration.calibrated_views import CalibratedView, CalibratedViews, save_views
+from calibration.calibration import Calibration, load_calibration, save_calibration
+from calibration.pose import Pose
+from calibration.side_view import SideView
 from reconstruct.appearance.brdf import LOBES, Gloss
 from reconstruct.detail.file import DETAIL, Detail, save_detail
 from reconstruct.detail.surface import Window
-from reconstruct.fields import Fields, Verdict, save_fields
+from reconstruct.fields import Fields, FurtherView, Verdict, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
 from reconstruct.solve.checkpoint_file import write_checkpoint
 from viewer.stage.pack_file import write_stage
@@ -78,6 +83,43 @@ def make(folder: Path, width: int = 64, n_lights: int = 6) -> Path:
     _write(run / "stage.json", {"format": 1, "notes": [note], "views": [saved], "crop": None, "guess": "shown"})
     write_stage(run)
     return run
+
+
+def make_several(folder: Path) -> Path:
+    """The same run with a second view, the object laid anew, a view that was left out, and a photo from the side."""
+    run = make(folder)
+    motion = Pose(Rotation.from_euler("z", 40, degrees=True).as_matrix(), np.array([80.0, -30.0, 0.0]))
+    own, back = load_calibration(run / "calibration.json"), motion.inverse()
+    own = replace(own, side_views=(_side_view(own),))
+    lights = tuple(replace(x, position=back.apply(np.array(x.position))) for x in own.lights)
+    turned = replace(own, world_from_camera=back @ own.world_from_camera, lights=lights, side_views=())
+    lie = CalibratedViews((CalibratedView("turned_1", turned),), name="turned_1")
+    views = (CalibratedView("view_1", own), CalibratedView("view_2", own))
+    save_views(CalibratedViews(views, (("view_3", "no board was found"),), (lie,)), run / "calibration.json")
+    fields = load_fields(run / "fields.safetensors")
+    poses = {"view_2": (own.world_from_camera, None), "turned_1": (turned.world_from_camera, motion)}
+    further = tuple(
+        FurtherView(name, fields.albedo, fields.camera, pose, torch.ones(5, 4), object_from_world=moved)
+        for name, (pose, moved) in poses.items()
+    )
+    fields = replace(fields, view="view_1", further=further, gloss=None, light_share=0.01)
+    save_fields(fields, run / "fields.safetensors")
+    save_detail(_detail(fields), fields, run / DETAIL)
+    for name in ("view_2", "turned_1"):
+        (run / name).mkdir()
+        for file in ("depth.npy", "normal.npy", "mask.png"):
+            (run / name / file).write_bytes((run / file).read_bytes())
+        for small in sorted((run / "thumbs").glob("photo_*.jpg")):
+            small.with_name(f"{name}-{small.name}").write_bytes(small.read_bytes())
+    (run / "stage.zip").unlink()
+    write_stage(run)
+    return run
+
+
+def _side_view(own: Calibration) -> SideView:
+    mask = np.zeros((6, 8), bool)
+    mask[2:5, 2:6] = True
+    return SideView("side.jpg", own.posed_camera, (4, 4, 32, 24), mask, np.ones_like(mask), 1.0)
 
 
 def _all_known(fields: Fields, n_lights: int) -> Fields:
@@ -367,7 +409,9 @@ def damaged(draw: random.Random, run: Path) -> str:
     if way is by_change:
         return said
     if draw.random() < 0.25 and all(_is_small_file(path) for path in _all_files(run)):
-        with suppress(OSError, ValueError, LookupError, SafetensorError):  # what is damaged cannot always be again
+        with suppress(
+            OSError, ValueError, LookupError, SafetensorError, BadZipFile
+        ):  # what is damaged cannot always be again
             said += "; " + draw.choice(WAYS)(draw, run)
     return said
 

@@ -36,7 +36,7 @@ def test_every_vertex_has_the_colour_of_its_evidence_and_the_legend_its_share_of
     mesh = trimesh.creation.box((2, 2, 2))
     above = mesh.vertices[:, 2] > 0
     kind = np.where(above, SEEN, np.where(mesh.vertices[:, 0] > 0, SHADOW, UNCONSTRAINED)).astype(np.uint8)
-    found = by_evidence(mesh, VertexEvidence(kind, np.ones(8, np.float32)))
+    found = by_evidence(mesh, VertexEvidence(kind, *np.ones((2, 8), np.float32)))
     for wanted, (colour, name) in EVIDENCE.items():
         assert (found.colours[kind == wanted] == colour).all()
         assert name in found.legend

@@ -67,7 +67,12 @@ def test_uncertain_lights_make_high_vertices_uncertain_and_the_volume_is_within_
     vertices, known = np.asarray(mesh.vertices), mesh.vertex_attributes["sigma"]
     doubted = vertex_evidence(replace(fields, light_share=0.05), vertices)
     assert doubted is not None
-    np.testing.assert_allclose(doubted.sigma**2, known**2 + (0.6 * 0.05 * vertices[:, 2]) ** 2, rtol=1e-3)
+    np.testing.assert_allclose(doubted.sigma**2, known**2 + doubted.lean**2, rtol=1e-3)
+    towards = fields.world_from_camera.translation - vertices
+    facing = np.abs((mesh.vertex_normals * towards).sum(1)) / np.linalg.norm(towards, axis=1)
+    across = np.where(doubted.kind == SEEN, np.maximum(facing, 0.5), 0.5)
+    high = vertices[:, 2] > 5  # mm: below, normals of the mesh are those of the cut
+    np.testing.assert_allclose(doubted.lean[high], (0.8 * 0.05 * across * vertices[:, 2])[high], rtol=0.1)
     true_volume = 4 / 3 * np.pi * BALL.radius**3
     under = max(0.0, BALL.radius - BALL.centre[2])  # the cap below the ground is no part of the mesh
     true_volume -= np.pi * under**2 * (BALL.radius - under / 3)

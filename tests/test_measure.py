@@ -44,6 +44,13 @@ def test_uncertainties_of_both_ends_add_as_independent_ones_do():
     assert length_between(a, b, (0.3, None)).sigma is None
 
 
+def test_what_moves_both_ends_alike_does_not_change_their_length():
+    a, b = np.zeros(3), np.array([3.0, 4.0, 0.0])
+    assert length_between(a, b, (0.5, 0.5), (0.4, 0.4)).sigma == pytest.approx(np.hypot(0.3, 0.3))
+    assert length_between(a, b, (0.5, 0.3), (0.4, 0.0)).sigma == pytest.approx(np.hypot(0.5, 0.3))
+    assert length_between(a, b, (0.5, 0.5), (0.5, 0.5)).sigma == 0
+
+
 def test_the_sigma_of_a_length_is_how_far_noisy_ends_scatter():
     rng = np.random.default_rng(0)
     a, b, spread = np.zeros(3), np.array([30.0, 40.0, 0.0]), (0.3, 0.4)

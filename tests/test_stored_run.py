@@ -42,7 +42,7 @@ from viewer.report.report import read_results, report_page, write_report
 from viewer.stage.pack_file import stored_stage
 
 ROOT = Path(__file__).parent.parent
-READERS = ("fields", "detail", "calibration", "mesh", "maps", "report", "manifest")
+READERS = ("fields", "detail", "calibration", "views", "mesh", "maps", "report", "manifest")
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +79,12 @@ def test_a_whole_run_is_read_without_a_word(whole):
     assert stored.detail is not None and stored.fields.gloss is not None
     assert stored.maps.depth.shape == stored.maps.mask.shape == (48, 64)
     assert "a note" in report_page(read_results(whole))
+
+
+def test_a_whole_run_of_several_views_and_lies_is_read_without_a_word(tmp_path):
+    run = damaged_runs.make_several(tmp_path)
+    assert read_all(run) == []
+    assert [name for name, _, _ in StoredRun(run).views] == ["view_1", "view_2", "turned_1"]
 
 
 def test_the_mesh_of_a_run_is_read_as_trimesh_reads_it(whole):

@@ -19,10 +19,13 @@ PIXELS_INSIDE = 0.1  # sigma of a constrained surface in pixel footprints, far f
 PIXELS_BESIDE = 0.3  # the same beside an unconstrained part, where less of the surroundings holds it
 PIXELS_AT_GROUND = 1.3  # the same at the ground, where shadows begin and all light is grazing
 REACH = 0.1  # of the object's diagonal: how far from there these two fade by e
-DRIFT = 0.35  # growth of sigma per distance from constrained surface, beyond which it is extrapolated as a plate
+DRIFT = 0.25  # growth of sigma per distance from constrained surface, beyond which it is extrapolated as a plate
 NO_LONGER = 7.0  # times that reach: what is left of either is below a thousandth
 GUESS_COHERENCE = 0.4  # of what guessed parts add to the volume if all were off to one side
-SHEARED = 0.6  # of the lights' uncertainty as a share of their distance: growth of sigma with height
+SHEARED = 0.8  # of the lights' uncertainty as a share of their distance: growth with height of a shear along the sight
+ACROSS = (
+    0.5  # of that shear that moves a surface across itself: the mean |cosine| of a normal that may have any direction
+)
 SEEN_WITHIN = 2.0  # voxels from a vertex to the first intersection of its camera ray with the surface
 
 
@@ -32,23 +35,26 @@ class VertexEvidence:
 
     kind: UInt8[np.ndarray, " n"]
     sigma: Float[np.ndarray, " n"]
+    lean: Float[np.ndarray, " n"]  # the part of sigma that all vertices share: what lights do that are off together
 
 
 def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> VertexEvidence | None:
     """Return the evidence for each vertex of a solved scene's surface; None if the solve stored no ray counts.
 
-    sigma^2 = f^2 (0.1^2 + (0.3 exp(-B / R))^2 + (1.3 exp(-h / R))^2) + (0.35 D)^2 + (0.6 s h)^2 with
+    sigma^2 = f^2 (0.1^2 + (0.3 exp(-B / R))^2 + (1.3 exp(-h / R))^2) + (0.25 D)^2 + (0.8 c s h)^2 with
 
     f: a pixel's footprint, that of the closest camera that sees the vertex, if one does
     B: the distance to the nearest vertex that nothing constrains; h: the height above the ground
     R: a tenth of the object's diagonal
     D: the distance to the nearest vertex that a camera sees or shadows constrain
     s: one sigma of a light's place over its distance (`Fields.light_share`)
+    c: |cosine| between the normal and the line of sight, at least 0.5, where a camera sees the vertex; elsewhere 0.5
 
-    The last term is what lights do that are off together, which calibrated ones mostly are: an object sheared along the
-    line of sight explains their shadows then. 0.6 s is one axis of a light's place. The numbers were fitted to five
-    solves of rendered captures and looked at on others (benchmarks/results_sigma.md). The scale of the printed board is
-    not included.
+    The last term, `lean`, is what lights do that are off together, which calibrated ones mostly are: an object sheared
+    along the line of sight explains their shadows then (Belhumeur, Kriegman, Yuille, The bas-relief ambiguity, 1999).
+    That moves a surface across itself the more it faces the camera; 0.5 is the mean over all directions. The numbers
+    were chosen on six solves of rendered captures (benchmarks/results_sigma.md). The scale of the
+    printed board is not included.
 
     Args:
         vertices: world.
@@ -56,9 +62,12 @@ def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Verte
     if fields.evidence is None or not len(vertices):
         return None
     grid = fields.grid
-    sights, footprints = [], []
+    sights, footprints, facing = [], [], []
+    normals = torch.nn.functional.normalize(grid.gradient(torch.from_numpy(vertices).float()), dim=1)
     for view in fields.views():
         eye, own = torch.from_numpy(view.posed_camera.centre).float(), view.in_world(vertices)
+        away = torch.from_numpy(vertices - view.in_common(view.posed_camera.centre[None])).float()
+        facing.append(((away * normals).sum(1) / away.norm(dim=1)).abs().double().numpy())
         points = torch.from_numpy(own).float()
         in_sight = in_line_of_sight(view.grid, eye, points, SEEN_WITHIN * grid.spacing).numpy()
         sights.append(in_sight & _in_picture(view, own))
@@ -69,8 +78,10 @@ def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Verte
     count = ndimage.map_coordinates(fields.evidence.float().numpy(), place.T, order=1, mode="nearest")
     kind = np.where(seen, SEEN, np.where(count >= FEWEST_RAYS, SHADOW, UNCONSTRAINED)).astype(np.uint8)
     height = np.maximum(vertices[:, 2] - fields.ground_height, 0.0)
-    sigma = np.hypot(_sigma(vertices, height, kind, footprint), SHEARED * fields.light_share * height)
-    return VertexEvidence(kind, sigma.astype(np.float32))
+    across = np.maximum(np.where(sights, facing, 0.0).max(axis=0), ACROSS)
+    lean = SHEARED * across * fields.light_share * height
+    sigma = np.hypot(_sigma(vertices, height, kind, footprint), lean)
+    return VertexEvidence(kind, sigma.astype(np.float32), lean.astype(np.float32))
 
 
 def volume_sigma(mesh: trimesh.Trimesh) -> float | None:

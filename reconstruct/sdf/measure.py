@@ -55,21 +55,33 @@ class Length:
     sigma: float | None  # one standard deviation; None if that of an end is unknown
 
 
-def length_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"], sigmas: tuple[float | None, ...]) -> Length:
-    """Return the distance of two world points with independent errors, each of one sigma along the line between them.
+def length_between(
+    a: Float[np.ndarray, "3"],
+    b: Float[np.ndarray, "3"],
+    sigmas: tuple[float | None, ...],
+    leans: tuple[float, float] = (0.0, 0.0),
+) -> Length:
+    """Return the distance of two world points whose errors lie along the line between them.
 
-    The sigmas are errors across the surface, and their part along the line is at most that, so the result is
-    conservative. The scale error of the whole scene (the accuracy of the printed board) is not included.
+    sigma^2 = s_a^2 + s_b^2 - 2 l_a l_b: errors are independent but for the part that both ends share. The sigmas are
+    errors across the surface, and their part along the line is at most that, so the result is conservative. The scale
+    error of the whole scene (the accuracy of the printed board) is not included.
+
+    Args:
+        sigmas: one sigma of each end, world length.
+        leans: the part of each that moves both ends alike (`VertexEvidence.lean`), at most its sigma.
     """
     value = float(np.linalg.norm(b - a))
     known = [sigma for sigma in sigmas if sigma is not None]
-    return Length(value, float(np.linalg.norm(known)) if len(known) == len(sigmas) else None)
+    if len(known) < len(sigmas):
+        return Length(value, None)
+    return Length(value, float(np.sqrt(max(np.square(known).sum() - 2 * leans[0] * leans[1], 0.0))))
 
 
 def sigma_at(
     picked: PickedPoint, vertices: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, " n"] | None
 ) -> float | None:
-    """Return a picked point's sigma, world length: the nearest vertex's; 0 on the ground, which defines the frame.
+    """Return a picked point's sigma (or lean): the nearest vertex's; 0 on the ground, which defines the frame.
 
     Args:
         vertices: world.

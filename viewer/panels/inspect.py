@@ -71,11 +71,15 @@ class InspectPanel:
         """Return the measured lengths as text."""
         return self._ruler.lengths()
 
-    def _sigma(self, picked: PickedPoint) -> float | None:
+    def _sigma(self, picked: PickedPoint) -> tuple[float | None, float]:
+        """Return one sigma of a point, None if it is unknown, and the part of it that all points share."""
         result, known = self._result, self._known
         if result is None or result.mesh is None:
-            return None
-        return sigma_at(picked, np.asarray(result.mesh.vertices), None if known is None else known.sigma)
+            return None, 0.0
+        vertices = np.asarray(result.mesh.vertices)
+        if known is None:
+            return sigma_at(picked, vertices, None), 0.0
+        return sigma_at(picked, vertices, known.sigma), sigma_at(picked, vertices, known.lean) or 0.0
 
     # --- colours -----------------------------------------------------------------------------------------------------
 

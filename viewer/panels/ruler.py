@@ -37,11 +37,11 @@ class DrawnLength:
 class Ruler:
     """A button, what to do next, and the lengths measured so far. Two clicks make a length."""
 
-    def __init__(self, context: PanelContext, sigma_of: Callable[[PickedPoint], float | None]):
+    def __init__(self, context: PanelContext, sigma_of: Callable[[PickedPoint], tuple[float | None, float]]):
         """Lay the controls out in the container of the caller's `with`.
 
         Args:
-            sigma_of: the uncertainty of a point, world length.
+            sigma_of: the uncertainty of a point and the part of it that all points share, world length.
         """
         gui = context.server.gui
         self._context, self._sigma_of = context, sigma_of
@@ -112,18 +112,17 @@ class Ruler:
                 self._drawn.append(DrawnLength((_end(self._context.server, f"{name}/start", picked, result.scale),)))
             else:
                 (first, first_pointing), self._first = self._first, None
-                length = length_between(
-                    first.place, picked.place, (self._sigma(first, first_pointing), self._sigma(picked, pointing))
-                )
+                sigmas, leans = zip(self._sigma(first, first_pointing), self._sigma(picked, pointing), strict=True)
+                length = length_between(first.place, picked.place, sigmas, leans)
                 words = length_text(length, result.calibration.unit)
                 self._lengths.append(words)
                 self._drawn.append(_line(self._context.server, name, (first, picked), words, result.scale))
             self._say()
 
-    def _sigma(self, end: PickedPoint, pointing: float) -> float | None:
-        """Return one sigma of an end: how well the surface is known there, and how well it was pointed at."""
-        surface = self._sigma_of(end)
-        return None if surface is None else float(np.hypot(surface, pointing))
+    def _sigma(self, end: PickedPoint, pointing: float) -> tuple[float | None, float]:
+        """Return one sigma of an end, by the surface there and by pointing at it, and the part that all ends share."""
+        surface, lean = self._sigma_of(end)
+        return (None if surface is None else float(np.hypot(surface, pointing))), lean
 
     def _say(self) -> None:
         """Show the measured lengths and the next step."""
