@@ -1,6 +1,7 @@
 """Truth: a ball over an endless plane, whose light for each other has closed forms or a plain integral."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from torch.nn.functional import normalize
 
 from calibration.light import Light
 from reconstruct.fields import Fields, load_fields, save_fields
-from reconstruct.labels import ground_test as ground_module
+from reconstruct.labels.ground_test import no_ground
+from reconstruct.labels.ground_test import test_ground as ground_tested
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.render.g_buffer import look
@@ -152,9 +154,12 @@ def test_how_white_surfaces_are_shows_in_what_they_send_each_other(true):
     assert math.isclose(true_scale(fields, photos, interreflection), true, abs_tol=0.03)
 
 
-def test_light_between_surfaces_turns_no_normals():
+@pytest.mark.parametrize("ground_known", [True, False])
+def test_light_between_surfaces_turns_no_normals(ground_known):
     """Three solids that stand close, whose light for each other the photos show: their creases look flat without it."""
     photos, truth = render(HEAP, Look(width=160, height=120, n_lights=20, noise=0.002))
+    if not ground_known:
+        photos = replace(photos, ground_known=False, mask=torch.from_numpy(truth.mask).float())
     fields = fields_of(truth)
     interreflection = photo_interreflection(fields, photos)
     assert interreflection is not None and photos.rgb is not None
@@ -164,7 +169,8 @@ def test_light_between_surfaces_turns_no_normals():
     photos.rgb[:, on] += albedo * sent
     observer = Observer(photos)
     points, normals = observer.seen(fields.grid)
-    endless = label_object(photos, points, normals, on.float(), ground_module.test_ground(photos)).normals
+    ground = ground_tested(photos) if ground_known else no_ground(photos)
+    endless = label_object(photos, points, normals, on.float(), ground).normals
     ours = observer.labels(fields.grid, photos).normals
     in_creases = sent.mean((0, 2)) > sent.mean((0, 2)).quantile(0.7)
 

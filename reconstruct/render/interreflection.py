@@ -34,8 +34,11 @@ class PhotoInterreflection:
 
 
 def photo_interreflection(fields: Fields, scene: Scene) -> PhotoInterreflection | None:
-    """Return the interreflection of a solved scene under the lights of its photos; None if there is no surface."""
-    found = find_patches(fields.grid, fields.ground_height)
+    """Return the interreflection of a solved scene under the lights of its photos; None if there is no surface.
+
+    A ground that is only assumed (not scene.ground_known) sends and receives nothing.
+    """
+    found = find_patches(fields.grid, scene.ground_height if scene.ground_known else None)
     if found is None:
         return None
     albedo = albedo_at(fields, seen_material(fields), found.points, found.on_object)
