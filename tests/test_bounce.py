@@ -138,8 +138,11 @@ def test_the_bottom_of_the_world_has_no_patches():
     assert find_patches(SdfGrid(torch.ones(4, 4, 4), torch.zeros(3), 0.1), 0.0) is None
 
 
-@pytest.mark.parametrize("true", [0.0, 0.7])
-def test_how_white_surfaces_are_shows_in_what_they_send_each_other(true):
+@pytest.mark.parametrize(
+    ("true", "room", "ground_known"), [(0.0, 0, True), (0.7, 0, True), (0.0, 3, False), (0.7, 3, False)]
+)
+def test_how_white_surfaces_are_shows_in_what_they_send_each_other(true, room, ground_known):
+    """Also where nothing tells the room's light: it is not taken for light between surfaces, nor the reverse."""
     photos, truth = render((BALL,), Look(n_lights=12, texture=0.3, noise=0.002))
     spacing, origin = 2.5, torch.tensor([-50.0, -50.0, -5.0])
     nodes = torch.stack(torch.meshgrid(*[torch.arange(n) for n in (41, 41, 38)], indexing="ij"), -1)
@@ -148,9 +151,11 @@ def test_how_white_surfaces_are_shows_in_what_they_send_each_other(true):
     camera, pose = truth.calibration.camera, truth.calibration.world_from_camera
     fields = Fields(grid, albedo, camera, pose, 0.0, "mm")
     interreflection = photo_interreflection(fields, photos)
+    photos = replace(photos, ground_known=ground_known)
     assert interreflection is not None and photos.rgb is not None
     on_ball = torch.from_numpy(truth.mask)
-    photos.rgb[:, on_ball] += true * albedo[on_ball] * interreflection.at(at[on_ball], facing[on_ball])
+    sent = interreflection.at(at[on_ball], facing[on_ball])
+    photos.rgb[:, on_ball] += albedo[on_ball] * (true * sent + room * sent.mean())
     assert math.isclose(true_scale(fields, photos, interreflection), true, abs_tol=0.03)
 
 
