@@ -1,6 +1,7 @@
 """Truth: a ball over an endless plane, whose light for each other has closed forms or a plain integral."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from torch.nn.functional import normalize
 
 from calibration.light import Light
 from reconstruct.fields import Fields, load_fields, save_fields
-from reconstruct.labels import ground_test as ground_module
+from reconstruct.labels.ground_test import no_ground
+from reconstruct.labels.ground_test import test_ground as ground_tested
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.render.g_buffer import look
@@ -136,8 +138,11 @@ def test_the_bottom_of_the_world_has_no_patches():
     assert find_patches(SdfGrid(torch.ones(4, 4, 4), torch.zeros(3), 0.1), 0.0) is None
 
 
-@pytest.mark.parametrize("true", [0.0, 0.7])
-def test_how_white_surfaces_are_shows_in_what_they_send_each_other(true):
+@pytest.mark.parametrize(
+    ("true", "room", "ground_known"), [(0.0, 0, True), (0.7, 0, True), (0.0, 3, False), (0.7, 3, False)]
+)
+def test_how_white_surfaces_are_shows_in_what_they_send_each_other(true, room, ground_known):
+    """Also where nothing tells the room's light: it is not taken for light between surfaces, nor the reverse."""
     photos, truth = render((BALL,), Look(n_lights=12, texture=0.3, noise=0.002))
     spacing, origin = 2.5, torch.tensor([-50.0, -50.0, -5.0])
     nodes = torch.stack(torch.meshgrid(*[torch.arange(n) for n in (41, 41, 38)], indexing="ij"), -1)
@@ -146,15 +151,20 @@ def test_how_white_surfaces_are_shows_in_what_they_send_each_other(true):
     camera, pose = truth.calibration.camera, truth.calibration.world_from_camera
     fields = Fields(grid, albedo, camera, pose, 0.0, "mm")
     interreflection = photo_interreflection(fields, photos)
+    photos = replace(photos, ground_known=ground_known)
     assert interreflection is not None and photos.rgb is not None
     on_ball = torch.from_numpy(truth.mask)
-    photos.rgb[:, on_ball] += true * albedo[on_ball] * interreflection.at(at[on_ball], facing[on_ball])
+    sent = interreflection.at(at[on_ball], facing[on_ball])
+    photos.rgb[:, on_ball] += albedo[on_ball] * (true * sent + room * sent.mean())
     assert math.isclose(true_scale(fields, photos, interreflection), true, abs_tol=0.03)
 
 
-def test_light_between_surfaces_turns_no_normals():
+@pytest.mark.parametrize("ground_known", [True, False])
+def test_light_between_surfaces_turns_no_normals(ground_known):
     """Three solids that stand close, whose light for each other the photos show: their creases look flat without it."""
     photos, truth = render(HEAP, Look(width=160, height=120, n_lights=20, noise=0.002))
+    if not ground_known:
+        photos = replace(photos, ground_known=False, mask=torch.from_numpy(truth.mask).float())
     fields = fields_of(truth)
     interreflection = photo_interreflection(fields, photos)
     assert interreflection is not None and photos.rgb is not None
@@ -164,7 +174,8 @@ def test_light_between_surfaces_turns_no_normals():
     photos.rgb[:, on] += albedo * sent
     observer = Observer(photos)
     points, normals = observer.seen(fields.grid)
-    endless = label_object(photos, points, normals, on.float(), ground_module.test_ground(photos)).normals
+    ground = ground_tested(photos) if ground_known else no_ground(photos)
+    endless = label_object(photos, points, normals, on.float(), ground).normals
     ours = observer.labels(fields.grid, photos).normals
     in_creases = sent.mean((0, 2)) > sent.mean((0, 2)).quantile(0.7)
 

@@ -99,7 +99,7 @@ class Observer:
     ) -> ObjectLabels:
         """Label the object's pixels from shading, with highlights removed if it is glossy.
 
-        A first look under an endless ground gives the albedo with which light between surfaces is found.
+        A first look under an endless ground, or none, gives the albedo with which light between surfaces is found.
         """
         assert self._ground is not None
         on_object = label_object(scene, points, normals, self._ground.mask, self._ground)
@@ -153,7 +153,7 @@ class Observer:
         scene = self._with_powers(scene, points, normals)
         read = partial(self._appearance, scene, points, normals, lit_pixels(scene, surface, points, normals))
         first = self._solved(surface, scene, *read(self._bounce(scene, points)))
-        scale, indirect = self._between_surfaces(first, scene)
+        scale, indirect = self._between_surfaces(first, scene) if scene.ground_known else (0.0, None)
         if indirect is None:
             return first
         albedo, gloss = read(indirect)
@@ -161,8 +161,7 @@ class Observer:
 
     def _between_surfaces(self, solved: Fields, scene: Scene) -> tuple[float, Indirect | None]:
         """Return the true scale of the albedo, and the light between surfaces; 0 and None where none shows."""
-        known = scene.ground_known and self._relief is None
-        interreflection = photo_interreflection(solved, scene) if known else None
+        interreflection = photo_interreflection(solved, scene) if self._relief is None else None
         scale = 0.0 if interreflection is None else true_scale(solved, scene, interreflection)
         if interreflection is None or scale == 0:
             return 0.0, None

@@ -85,18 +85,19 @@ def _keys(points: Tensor, normals: Tensor, size: float) -> np.ndarray:
     return np.ascontiguousarray(torch.cat([points / size, NORMAL_WEIGHT * normals], 1).double().numpy())
 
 
-def find_patches(grid: SdfGrid, ground_height: float) -> Patches | None:
+def find_patches(grid: SdfGrid, ground_height: float | None) -> Patches | None:
     """Return the patches of an object and its ground with the visibility between them; None if there is no surface.
 
     Args:
-        ground_height: world z.
+        ground_height: world z; None: there is no ground.
     """
-    points, normals, size = _on_surface(grid, ground_height)
+    height = -torch.inf if ground_height is None else ground_height
+    points, normals, size = _on_surface(grid, height)
     if not len(points):
         return None
     middle = (points.amax(0) + points.amin(0)) / 2
     radius = float((points - middle).norm(dim=-1).max())
-    floor = _on_ground(middle, radius, ground_height)
+    floor = torch.zeros(0, 3) if ground_height is None else _on_ground(middle, radius, ground_height)
     floor = floor[grid.sdf(floor) > 0]
     up = torch.tensor([0.0, 0.0, 1.0]).expand_as(floor)
     everywhere, facing = torch.cat([points, floor]), torch.cat([normals, up])
@@ -105,7 +106,7 @@ def find_patches(grid: SdfGrid, ground_height: float) -> Patches | None:
     seen = torch.full((len(everywhere), DIRECTIONS), len(everywhere))
     patches = Patches(everywhere, facing, on_object, starts, seen, size)
     lit = torch.nonzero(on_object | ((everywhere - middle)[:, :2].norm(dim=-1) < LIT_REACH * radius))[:, 0]
-    seen[lit] = _hit_patches(grid, patches, lit, ground_height)
+    seen[lit] = _hit_patches(grid, patches, lit, height)
     return patches
 
 
