@@ -17,7 +17,7 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.early_stopping import COOL_DOWN, REST, EarlyStopping
 from reconstruct.solve.solver import fit
 
-SCATTER = 0.25  # mm, of the mean of two solves: about a tenth of a pixel, measured over seeds and numbers of cores
+SCATTER = 0.25  # mm, of the mean of some solves: about a tenth of a pixel, measured over seeds and numbers of cores
 
 
 def ball(scene, truth, grow: float = 0.0) -> SdfGrid:
@@ -91,12 +91,12 @@ def test_a_surface_that_gets_much_worse_is_taken_back():
     assert EarlyStopping().after(0.02, good).after(0.021, bad).chosen(bad) is bad
 
 
-@pytest.mark.slow  # 24 s: four solves for one mean
+@pytest.mark.slow  # 25 s: eight solves for two means
 def test_twice_the_iterations_are_no_worse_than_solves_scatter():
     scene, truth, _ = shadows()
     errors = {1.0: [], 2.0: []}
     for factor, found in errors.items():
-        for seed in (0, 1):
+        for seed in range(4):  # means of two differed by up to .3 mm between kinds of processors
             solved = fit(scene, shortened(replace(SMALL, seed=seed), factor), Listener())
             found.append(depth_error(solved, scene, truth))
     assert np.mean(errors[2.0]) < 1.02 * np.mean(errors[1.0]) + SCATTER, errors
