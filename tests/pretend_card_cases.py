@@ -39,10 +39,10 @@ def seen(look: Look) -> Scene:
     return replace(scene, rgb=None) if look.with_shadow else scene
 
 
-def end_alike(found: Fields, expected: Fields) -> None:
-    """Two surfaces but for rounding."""
+def end_alike(found: Fields, expected: Fields, mean: float = 0.01) -> None:
+    """Two surfaces but for rounding; `mean` and half a voxel are the most that they may be apart, in voxels."""
     apart = (found.grid.values - expected.grid.values).abs() / expected.grid.spacing
-    assert apart.mean() < 0.02 and apart.max() < 0.5  # moving lights: .0101 on one kind of processor, less on others
+    assert apart.mean() < mean and apart.max() < 0.5
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,8 @@ def test_a_solve_ends_as_on_the_cpu(look):
 
 def test_a_solve_that_moves_lights_ends_as_on_the_cpu():
     scene = misplaced(seen(COLOUR), 0.03)
-    end_alike(*(fit(scene, MOVING, lambda **_: None, device=place) for place in (CARD, CPU)))
+    card, cpu = (fit(scene, MOVING, lambda **_: None, device=place) for place in (CARD, CPU))
+    end_alike(card, cpu, mean=0.02)  # .0101 on one kind of processor, less on others
 
 
 @pytest.mark.parametrize("look", [COLOUR, SHADOW])

@@ -23,9 +23,7 @@ DRIFT = 0.25  # growth of sigma per distance from constrained surface, beyond wh
 NO_LONGER = 7.0  # times that reach: what is left of either is below a thousandth
 GUESS_COHERENCE = 0.4  # of what guessed parts add to the volume if all were off to one side
 SHEARED = 0.8  # of the lights' uncertainty as a share of their distance: growth with height of a shear along the sight
-ACROSS = (
-    0.5  # of that shear that moves a surface across itself: the mean |cosine| of a normal that may have any direction
-)
+ACROSS = 0.5  # of that shear across a surface that may face any way: the mean |cosine| of its normal to the sight
 SEEN_WITHIN = 2.0  # voxels from a vertex to the first intersection of its camera ray with the surface
 
 
