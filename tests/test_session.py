@@ -107,11 +107,12 @@ def test_linked_photos_and_folders_are_followed(tmp_path):
 def test_settings_overrule_what_was_found(tmp_path):
     folder, _, _ = save_capture(tmp_path, in_folders=False)
     (folder / "session.toml").write_text(
-        'board = "checkerboard:9x6:24.25"\nled_offset_mm = [12, -6, 1.5]\n'
+        'board = "checkerboard:9x6:24.25"\nboard_thickness_mm = 3\nled_offset_mm = [12, -6, 1.5]\n'
         '[roles]\nboard = ["IMG_9.jpg"]\ndark = ["IMG_108.jpg"]\n'
     )
     session = load_session(folder)
     assert session.settings.board == "checkerboard:9x6:24.25" and session.settings.led_offset_mm == (12.0, -6.0, 1.5)
+    assert session.settings.board_thickness_mm == 3.0
     assert names(session.board)[0] == "IMG_9.jpg"
     assert names(session.lit)[-1] == "IMG_107.jpg" and names(session.dark) == ["IMG_108.jpg"]
 
@@ -125,6 +126,7 @@ def test_settings_overrule_what_was_found(tmp_path):
         ("led_offset_mm = [nan, 0, 1]", "three numbers"),
         (f"led_offset_mm = [{'9' * 400}, 0, 1]", "three numbers"),
         (f"clip_frames = {'9' * 5000}", "not valid TOML"),
+        ("board_thickness_mm = -1", "millimetres from the table"),
         ("board = ", "not valid TOML"),
         ("roles = { lid = ['a.jpg'] }", "lists of file names"),
     ],

@@ -23,6 +23,7 @@ class Blank:
     radius_mm: float  # of its rounded corners
     sigma_mm: float  # one sigma of each side: how well such sheets are cut
     curl_mm: float  # one sigma of how far its edges lie above the table
+    thickness_mm: float  # from the table to its upper side; 0: the object stands on it
 
     def spec(self) -> str:
         """The board as the text that parse_board reads."""
@@ -70,9 +71,10 @@ class Blank:
         return sides
 
 
-# ISO 216 admits 2 mm on the sides of A4, but machines cut within half a millimetre; ISO/IEC 7810 gives a card 0.13.
+# ISO 216 admits 2 mm on the sides of A4, but machines cut within half a millimetre; ISO/IEC 7810 gives a card 0.13,
+# and a thickness of 0.76.
 BLANKS = {
-    "paper:a4": Blank("paper:A4", 297.0, 210.0, 0.0, 0.4, 0.4),
-    "paper:letter": Blank("paper:letter", 279.4, 215.9, 0.0, 0.4, 0.4),
-    "card": Blank("card", 85.60, 53.98, 3.18, 0.06, 0.2),
+    "paper:a4": Blank("paper:A4", 297.0, 210.0, 0.0, 0.4, 0.4, 0.0),
+    "paper:letter": Blank("paper:letter", 279.4, 215.9, 0.0, 0.4, 0.4, 0.0),
+    "card": Blank("card", 85.60, 53.98, 3.18, 0.06, 0.2, 0.76),
 }

@@ -1,6 +1,7 @@
 """The board: its pattern and the places of its corners in the world frame (mm)."""
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ EXAMPLES = (
     "or checkerboard:9x6:24.25 (inner corners, square mm); without a printer paper:A4, paper:letter or card"
 )
 BLANK_KINDS = ("paper", "card")
+PAPER_THICKNESS = 0.1  # mm: office paper of 80 g/m2
 LARGEST_SIDE = 100  # squares: more than any printer resolves in a photo, so a slip of the finger
 WORLD_FROM_OPENCV_BOARD = Pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))  # OpenCV's z points into the table
 
@@ -29,6 +31,7 @@ class Board:
     square_mm: float
     marker_mm: float = 0.0  # ChArUco only
     dictionary: str = ""  # ChArUco only, OpenCV's name
+    thickness_mm: ClassVar[float] = PAPER_THICKNESS  # from the table to its printed side, unless session.toml says it
 
     def __post_init__(self):
         if self.kind not in ("charuco", "checkerboard"):

@@ -22,13 +22,14 @@ from capture.photos.photo import read_photo
 from capture.session.session import Session
 
 OTHER_PAPER, OTHER_PAPER_SIGMAS = 0.02, 4.0  # of the log of the sides' ratio: A4 and letter differ by 0.09
+THICKNESS_SIGMA = 0.1  # mm: office paper has 0.1, photo paper 0.25, and the object may stand on the sheet
 ROBUST_NOISES = 3.0  # sigmas of the bundle's corner noise, from which a corner of one of several views counts less
 
 
 class BoardFit(NamedTuple):
     """The camera of one place of the tripod, as the board shows it."""
 
-    posed_camera: PosedCamera  # ground z = 0, mm
+    posed_camera: PosedCamera  # printed side z = 0, ground below it by the board's thickness, mm
     lens: CameraFit
     residuals: dict[str, Any]
 
@@ -63,7 +64,10 @@ def fit_board(session: Session, board_spec: str | None = None) -> BoardFit:
 def fit_boards(
     sessions: Sequence[Session], shared: Sequence[Path] = (), board_spec: str | None = None
 ) -> list[BoardFit | CalibrationError]:
-    """Return the tripod's camera above the board (ground z = 0, mm) of each view of a capture, or why there is none.
+    """Return the tripod's camera above board and ground (mm) of each view of a capture, or why there is none.
+
+    The board's printed side is z = 0. The ground is the table, below it by the thickness that session.toml states, or
+    else by that of paper or card: shadows fall on the table.
 
     The first board photo of a session is the tripod's and gives the ground; the others only improve the lens. Photos
     of one pixel size and one focal length by EXIF share the lens. A tripod's photo that does not fit that lens gets one
@@ -95,7 +99,16 @@ def fit_boards(
     for group in _lens_groups(found):
         for view, fit in zip(group, _fit_group([found[view] for view in group], extra, notes, is_named), strict=True):
             fits[view] = fit
-    return fits
+    stated = sessions[0].settings.board_thickness_mm
+    thickness = board.thickness_mm if stated is None else stated
+    return [fit if isinstance(fit, CalibrationError) else _on_table(fit, thickness) for fit in fits]
+
+
+def _on_table(fit: BoardFit, thickness_mm: float) -> BoardFit:
+    """Return the fit with its ground on the table, which is the board's thickness below the printed side."""
+    sigma = float(np.hypot(fit.residuals["camera_height_sigma_mm"], THICKNESS_SIGMA))
+    residuals = fit.residuals | {"board_thickness_mm": thickness_mm, "camera_height_sigma_mm": sigma}
+    return BoardFit(replace(fit.posed_camera, ground_height=-thickness_mm), fit.lens, residuals)
 
 
 def _read(sessions: Sequence[Session], shared: Sequence[Path]) -> list[_Photo]:

@@ -13,6 +13,7 @@ LIGHT_KINDS = ("flashlight", "sun")
 MOST_LIGHTS = 4  # at once
 PHONE_THICKNESS = 8.5  # mm: phones have 7 to 10
 HEIGHT_SIGMA = 0.01  # share of a height measured with a ruler, unless its error is given
+THICKEST_BOARD = 100.0  # mm: on a book
 LEAST_HEIGHT_SIGMA = 0.5  # mm: a ruler's division, and where the highest point is
 
 
@@ -74,6 +75,20 @@ def parse_height(value: Any, path: Path) -> Height | None:
         )
     sigma = numbers[1] if len(numbers) == 2 else max(HEIGHT_SIGMA * numbers[0], LEAST_HEIGHT_SIGMA)
     return Height(numbers[0], sigma)
+
+
+def parse_thickness(value: Any, path: Path) -> float | None:
+    """Parse the entry `board_thickness_mm` of session.toml: from the table to the board's printed side, mm.
+
+    Raises:
+        CaptureError: the value is no length from 0 to THICKEST_BOARD.
+    """
+    if value is not None and (not is_number(value) or not 0 <= value <= THICKEST_BOARD):
+        raise CaptureError(
+            f"{path}: board_thickness_mm is {value!r}, millimetres from the table to the board's printed side, 0 to "
+            f"{THICKEST_BOARD:g}, are needed. Measure the board with what it is glued to; 0: the object stands on it."
+        )
+    return None if value is None else float(value)
 
 
 def parse_phone_back(value: Any, path: Path) -> PhoneBack:

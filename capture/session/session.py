@@ -21,6 +21,7 @@ from capture.session.declared_objects import (
     parse_declared,
     parse_height,
     parse_phone_back,
+    parse_thickness,
 )
 from capture.session.roles import NoBoardError, Roles, find_roles, find_tripod_first
 
@@ -37,6 +38,7 @@ MOST_CLIP_FRAMES = 300
 SETTINGS = (
     "ball",
     "board",
+    "board_thickness_mm",
     "clip_frames",
     "cubes",
     "height",
@@ -64,6 +66,7 @@ class SessionSettings:
     ball: tuple[float, float, float] | None = None  # x, y, radius (px) of a shiny ball whose highlights show the light
     scale: float | None = None  # mm: the object's height, or without ground its largest extent in the picture
     height: Height | None = None  # of the object's highest point above the table
+    board_thickness_mm: float | None = None  # from the table to the printed side: paper, and what it is glued to
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,8 @@ def load_session(folder: Path, common: SessionSettings | None = None) -> Session
     if common is not None:
         settings = settings if (folder / SETTINGS_FILE).exists() else replace(common, roles=())
         settings = replace(settings, board=settings.board or common.board)
+        if settings.board_thickness_mm is None:
+            settings = replace(settings, board_thickness_mm=common.board_thickness_mm)
     sorted_already = (folder / ROLE_FOLDERS["lit"]).is_dir() or (folder / ROLE_FOLDERS["board"]).is_dir()
     roles, notes = _roles_of_folders(folder, settings) if sorted_already else _roles_of_flat_folder(folder, settings)
     roles = _overruled(roles, folder, settings)
@@ -145,7 +150,8 @@ def load_settings(folder: Path) -> SessionSettings:
     scale = None if "scale" not in entries else parse_length(entries["scale"], f"{path}: scale")
     ball = _ball(entries.get("ball"), path)
     height = parse_height(entries.get("height"), path)
-    return SessionSettings(board, offset, names, count, parse_declared(entries, path), back, ball, scale, height)
+    thick = parse_thickness(entries.get("board_thickness_mm"), path)
+    return SessionSettings(board, offset, names, count, parse_declared(entries, path), back, ball, scale, height, thick)
 
 
 def read_entries(path: Path) -> dict[str, Any]:
