@@ -7,7 +7,7 @@ from board_photos import board_photo, corners_of, look_at, slanted
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.board.board import Board, parse_board
+from calibration.board.board import Board, opencv_dictionary, parse_board
 from calibration.board.board_pose import board_views, fit_ground, locate_ground
 from calibration.board.corners import Corners, find_board
 from calibration.board.recognise import _layout, guess_board
@@ -197,8 +197,18 @@ def test_columns_and_markers_are_told_though_some_markers_are_false(n_false):
     corners = cv2.perspectiveTransform((cells[:, None] + squares).reshape(1, -1, 2), view).reshape(-1, 4, 2)
     corners[rng.choice(len(cells), n_false, replace=False)] += rng.uniform(100, 300, (n_false, 1, 2))
     layout = _layout(np.arange(len(cells)), corners)
-    assert layout is not None and layout[0] == 5
-    assert layout[1] == pytest.approx(0.73, abs=0.01)
+    assert layout is not None and layout.columns == 5
+    assert layout.ratio == pytest.approx(0.73, abs=0.01)
+
+
+def test_a_false_marker_beside_the_board_adds_no_rows():
+    photo = board_photo(CHARUCO, CAMERA, POSE)
+    marker = cv2.aruco.generateImageMarker(opencv_dictionary("DICT_4X4_1000"), 609, 48)
+    photo[4:88, 4:88] = 255
+    photo[20:68, 20:68] = marker
+    guess = guess_board([photo])
+    assert guess is not None and guess.board.spec().startswith("charuco:5x7:")
+    assert guess.board.dictionary == "DICT_4X4_50"
 
 
 def test_nothing_is_guessed_where_there_is_no_board():

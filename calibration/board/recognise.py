@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -72,12 +73,9 @@ def _guess_charuco(photos: Sequence[Grey]) -> Board | None:
         seen = [_markers(photo, family[0]) for photo in small]
         if len(family) > 1 and max((len(ids) for ids, _ in seen), default=0) >= FEWEST_MARKERS:
             seen = [_markers(photo, family[-1]) for photo in small]  # larger boards go on in the larger dictionaries
-        for markers in sorted(seen, key=lambda found: -len(found[0]))[:2]:
-            layout = _layout(*markers)
-            if layout is None:
-                continue
-            columns, ratio = layout
-            top = max(int(ids.max()) for ids, _ in seen if len(ids))
+        layouts = [found for found in (_layout(*markers) for markers in seen) if found is not None]
+        for columns, ratio, _, _ in sorted(layouts, key=lambda one: -one.n_markers)[:2]:
+            top = max(one.top for one in layouts if one.columns == columns)
             board, n_corners = _with_hidden_rows(_charuco(columns, top, ratio, family), small)
             if n_corners and (best is None or n_corners > best[0]):
                 best = n_corners, board
@@ -91,12 +89,21 @@ def _markers(photo: Grey, dictionary: str) -> Markers:
     return np.ravel(ids).astype(int), np.asarray(corners, np.float64).reshape(-1, 4, 2)
 
 
-def _layout(ids: Int[np.ndarray, " n"], corners: Float[np.ndarray, "n 4 2"]) -> tuple[int, float] | None:
-    """Return columns of squares and the ratio marker / square from consecutive markers; None for no regular board."""
+class _Layout(NamedTuple):
+    """How the markers of a photo lie on a regular board."""
+
+    columns: int  # of squares
+    ratio: float  # marker / square
+    n_markers: int  # that lie so
+    top: int  # the largest number among these: false markers may have any
+
+
+def _layout(ids: Int[np.ndarray, " n"], corners: Float[np.ndarray, "n 4 2"]) -> _Layout | None:
+    """Return how consecutive markers lie on a board; None for no regular board."""
     if len(ids) < FEWEST_MARKERS:
         return None
     centres = corners.mean(1)
-    best: tuple[int, float, int, float] | None = None
+    best: tuple[int, float, _Layout] | None = None
     for columns in range(3, MOST_COLUMNS + 1):
         for is_legacy in (False, True):
             cells = _cells(columns, int(ids.max()) + 1, is_legacy)[ids]
@@ -111,10 +118,11 @@ def _layout(ids: Int[np.ndarray, " n"], corners: Float[np.ndarray, "n 4 2"]) -> 
                 continue
             flat = cv2.perspectiveTransform(corners[good].reshape(-1, 1, 2), matrix).reshape(-1, 4, 2)
             ratio = float(np.median(np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=2)))
-            score = (int(good.sum()), -float(off[good].mean()), columns, ratio)
+            layout = _Layout(columns, ratio, int(good.sum()), int(ids[good].max()))
+            score = (layout.n_markers, -float(off[good].mean()), layout)
             if 0 < ratio < 1 and (best is None or score > best):
                 best = score
-    return (best[2], best[3]) if best else None
+    return best[2] if best else None
 
 
 def _cells(columns: int, n_markers: int, is_legacy: bool) -> Float[np.ndarray, "n 2"]:
