@@ -160,7 +160,11 @@ def _lights(
         return fit, [f"{fit.residuals['cue']}, because {error}"]
     n_views = len(fit.residuals["phone_photos"])
     back_notes = [fit.residuals["phone_back"]["why"]] if "phone_back" in fit.residuals else unread
-    how = f"lights: {n_views} of {len(fit.lights)} from the phone's photos of the board, the rest from shading"
+    away, sigma = np.linalg.norm(fit.residuals["led_offset_mm"]), fit.residuals["led_offset_sigma_mm"]
+    how = (
+        f"lights: {n_views} of {len(fit.lights)} from the phone's photos of the board, the rest from shading; its LED "
+        f"sits {away:.0f} +- {sigma:.0f} mm from its lens"
+    )
     return fit, [how, *back_notes]
 
 

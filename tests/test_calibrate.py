@@ -124,7 +124,8 @@ def test_an_unknown_way_to_find_lights_is_the_callers_mistake(truth):
 
 def test_a_photo_of_the_phones_back_that_tells_nothing_is_named_and_does_not_stop_the_calibration(truth, monkeypatch):
     fitted = glue.locate_lights(truth.stack, POSED_CAMERA, np.ones(8, bool))
-    with_phone = replace(fitted, residuals=fitted.residuals | {"phone_photos": {}})
+    led = {"led_offset_mm": [12.0, -5.0, 0.0], "led_offset_sigma_mm": 2.0}
+    with_phone = replace(fitted, residuals=fitted.residuals | {"phone_photos": {}} | led)
     told = []
 
     def by_phone(stack, posed_camera, usable, views):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ball_shadows import EYE, HEIGHT, MIDDLE, RADIUS, WIDTH, ball_camera, drawn, hits_ball
+from flashlight_photos import looking_at
 
 from calibration.flashlight import common_motion
 from calibration.flashlight.common_motion import same_shadows
@@ -14,12 +15,14 @@ from calibration.ground.ground_field import GroundField, fit_ground_field
 from calibration.ground.ground_shadows import GroundShadows, find_shadows, without_seams
 from calibration.ground.mirror_highlights import MirrorHighlights, find_highlights
 from calibration.lights.ground_cells import GroundCells, ground_points
+from calibration.outlines.carried_light import offset_by_outlines
 from calibration.outlines.coherence import PENUMBRA, residuals, softness
 from calibration.outlines.metric_cues import MetricCues
 from calibration.outlines.outline_maps import PIXEL_ERROR, outline_maps, with_cues
 from calibration.outlines.relocate import likely_places
 from calibration.outlines.shadow_start import STARTS, shadow_starts
 from calibration.outlines.terms import FALSE_SPOT, OutlineTerms
+from calibration.pose import Pose
 from calibration.side_view import SideView
 
 
@@ -66,6 +69,20 @@ def test_where_a_search_along_rays_begins_changes_nothing(ball):
     np.testing.assert_array_equal(again.emptiness, first.emptiness)
     np.testing.assert_array_equal(again.d_by, first.d_by)
     assert 0.1 < (first.emptiness > 0).mean() < 1 and first.emptiness.min() == 0
+
+
+def test_outlines_show_where_the_led_sits_beside_its_phones_lens(ball):
+    camera, lights, maps = ball
+    every, offset = np.ones(len(lights), bool), np.array([16.0, -9.0, 2.0])
+    poses = [looking_at(light, MIDDLE) for light in lights]
+    poses = [Pose(pose.rotation, light - pose.rotate(offset)) for pose, light in zip(poses, lights, strict=True)]
+    terms = OutlineTerms(maps, EYE, camera.ground_height, every, every & (np.arange(len(lights)) != 3))
+    found, covariance = offset_by_outlines(terms, [*poses[:3], None, *poses[4:]], lights)
+    sigma = np.sqrt(np.diag(covariance))
+    assert (np.abs(found - offset) < 2 * sigma).all() and np.linalg.norm(
+        (found - offset)[:2]
+    ) < 7  # of 18; a pixel is 2.2 mm
+    assert sigma[:2].max() < 5
 
 
 @pytest.mark.slow

@@ -73,22 +73,12 @@ def with_outlines(
         edges: where the ground ends, world: no shadow beyond them is looked at.
         cues: photos from the side, a height: they fix the numbers that outlines leave free.
     """
-    rgb, usable = stack.rgb[photos], ~stack.clipped[photos]
-    coarse = fit_ground_field(rgb, usable, beyond_ends(edges, posed_camera, rgb.shape[1:3]))
-    field = at_photo_size(coarse, rgb, usable, OUTLINE_SIDE)
-    shadows = of_one_ground(find_shadows(field))
-    maps = outline_maps(field, shadows, posed_camera)
-    if maps is None or len(np.unique(maps.owner)) < LEAST_SHADOWS * maps.n_photos():
+    found = outlines_of(stack, posed_camera, photos, edges, cues)
+    if found is None:
         return None
-    maps = with_cues(maps, cues, posed_camera)
-    eye, ground = posed_camera.centre, posed_camera.ground_height
-    every = np.ones(maps.n_photos(), bool)
-    whole = ~maps.is_cut & np.isin(np.arange(maps.n_photos()), maps.owner)
-    whole = whole if whole.sum() >= FEWEST_WHOLE else every
-    starts = shadow_starts(maps, shadows.object_mask, posed_camera)
-    points, near = near_ground(maps, posed_camera, coarse.albedo.shape)
-    spots = find_highlights(coarse, find_shadows(coarse), points, near)
-    terms = OutlineTerms(maps, eye, ground, every, whole, spots)
+    terms, shadows = found
+    whole = terms.trusted
+    starts = shadow_starts(terms.maps, shadows.object_mask, posed_camera)
     cells = replace(_lit_cells(evidence, shadows, posed_camera), outlines=terms)
     starts.append(by_shading)
     fit, number = searched(starts, cells)
@@ -99,6 +89,33 @@ def with_outlines(
     contrasts = (1.0,) if stack.is_linear else CONTRASTS
     found = at_best_contrast(complete.flashlights, replace(cells, outlines=complete.evidence.outlines), contrasts)
     return replace(found, between=found.between + fit.between) if _ground(found) >= MIN_GROUND / THIN else None
+
+
+def outlines_of(
+    stack: PhotoStack,
+    posed_camera: PosedCamera,
+    photos: Bool[np.ndarray, " photos"],
+    edges: Sequence[TableEdge] = (),
+    cues: MetricCues = NO_CUES,
+) -> tuple[OutlineTerms, GroundShadows] | None:
+    """Return the outlines in these photos of the stack, those that the picture does not cut trusted, and the shadows.
+
+    None without an object or enough shadows. Arguments as of with_outlines.
+    """
+    rgb, usable = stack.rgb[photos], ~stack.clipped[photos]
+    coarse = fit_ground_field(rgb, usable, beyond_ends(edges, posed_camera, rgb.shape[1:3]))
+    field = at_photo_size(coarse, rgb, usable, OUTLINE_SIDE)
+    shadows = of_one_ground(find_shadows(field))
+    maps = outline_maps(field, shadows, posed_camera)
+    if maps is None or len(np.unique(maps.owner)) < LEAST_SHADOWS * maps.n_photos():
+        return None
+    maps = with_cues(maps, cues, posed_camera)
+    every = np.ones(maps.n_photos(), bool)
+    whole = ~maps.is_cut & np.isin(np.arange(maps.n_photos()), maps.owner)
+    whole = whole if whole.sum() >= FEWEST_WHOLE else every
+    points, near = near_ground(maps, posed_camera, coarse.albedo.shape)
+    spots = find_highlights(coarse, find_shadows(coarse), points, near)
+    return OutlineTerms(maps, posed_camera.centre, posed_camera.ground_height, every, whole, spots), shadows
 
 
 def _ground(fit: FlashlightFit) -> int:

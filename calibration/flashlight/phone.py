@@ -1,5 +1,6 @@
 """Locate the flashlight in each photo from the board as seen by the phone that carries it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,12 +19,17 @@ from calibration.flashlight.fit import (
     refit_outliers,
     without_gloss,
 )
-from calibration.flashlight.led_offset import QUARTER_TURNS, BackView, Choice, choose
+from calibration.flashlight.led_offset import FITTED_SIGMA, QUARTER_TURNS, BackView, Choice, choose
 from calibration.flashlight.light_estimate import LightFit, describe
 from calibration.flashlight.model import Flashlights, free_tangent
+from calibration.flashlight.outline_lights import outlines_of
 from calibration.flashlight.tone_curve import WORST_STEPS, compare_curves
 from calibration.flashlight.uncertainty import position_sigma, unseen_error
+from calibration.ground.table_edges import TableEdge
+from calibration.lights.fusion import disagree, fuse
 from calibration.lights.ground_cells import ground_ends
+from calibration.outlines.carried_light import offset_by_outlines
+from calibration.outlines.terms import DROP_OUTLINE
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
@@ -39,6 +45,8 @@ IN_STEP = 0.85  # of the distance to phones that are out of step
 OFFSET_ERROR_MM = (2.0, 1.0)  # of the LED's place beside the lens, fitted (1 to 6 mm in simulations) and given
 FARTHEST_LED_MM, DEEPEST_LED_MM = 50.0, 15.0  # from its lens, and along the lens's axis; a fit errs by up to 6 mm
 UNKNOWN_OFFSET_MM = 18.0  # the LED's usual distance from its lens, where neither shading nor the owner tells it
+_Offset = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]  # and its covariance, mm
+AGREEING = 0.75  # of the outlines must agree before they are believed against the shading
 QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -74,16 +82,17 @@ def locate_lights_from_phone(
 ) -> LightFit:
     """Return one point light per usable photo: the phone's pose from the board plus the LED's offset from its lens.
 
-    The lens is calibrated from the same photos. The LED's offset (unless known), the beam's tilt against the lens and
-    the beam's profile are common to all photos and fitted to the ground's shading. Photos without a pose are fitted to
-    the shading with the same beam. Phone photos are paired with lit photos in order; the pairing is checked against the
-    places from shading alone.
+    The lens is calibrated from the same photos. The LED's offset (unless known, or outlines of shadows contradict it),
+    the beam's tilt against the lens and the beam's profile are common to all photos and fitted to the ground's shading.
+    Photos without a pose are fitted to the shading with the same beam. Phone photos are paired with lit photos in
+    order; the pairing is checked against the places from shading alone.
 
     Raises:
         CalibrationError: fewer than 4 phone photos show the board, or as locate_lights raises.
     """
     evidence, photos = collect(stack, posed_camera, usable)
-    evidence = before_ends(evidence, ground_ends(stack, posed_camera, usable))
+    edges = ground_ends(stack, posed_camera, usable)
+    evidence = before_ends(evidence, edges)
     lens, poses = _poses(views)
     alone = refit_outliers(without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent)))
     poses = _least_turned(poses, views, alone.flashlights)
@@ -94,7 +103,8 @@ def locate_lights_from_phone(
     if carried.posed().sum() < MIN_VIEWS:
         raise _too_few(int(carried.posed().sum()), views)
     lens_error = lens.camera.sigmas["fx"] / lens.camera.fx * carried.reach  # a longer lens stands farther away
-    fit, offset_error, choice = _fit(carried, alone, views, float(np.median(lens_error[carried.posed()])))
+    shown = None if views.led_offset_mm else _shown_by_outlines(carried, alone, stack, posed_camera, usable, edges)
+    fit, offset_error, choice = _fit(carried, alone, views, float(np.median(lens_error[carried.posed()])), shown)
     floor = np.where(carried.posed(), np.hypot(offset_error, lens_error), unseen_error(fit))
     tone = compare_curves(fit, np.array(stack.gains)[photos], stack.is_linear)
     names, floor = [stack.paths[k].name for k in photos], np.hypot(floor, WORST_STEPS * tone.error())
@@ -105,6 +115,7 @@ def locate_lights_from_phone(
         | {
             "tone": tone.document(),
             "led_offset_mm": _led_offset(fit, carried).tolist(),
+            "led_offset_sigma_mm": offset_error,
             "phone_reprojection_rms_px": lens.rms_px,
             "phone_focal_px": lens.camera.fx,
             "phone_photos": {
@@ -117,17 +128,42 @@ def locate_lights_from_phone(
     return replace(found, residuals=residuals)
 
 
+def _shown_by_outlines(
+    carried: _Carried,
+    alone: FlashlightFit,
+    stack: PhotoStack,
+    posed_camera: PosedCamera,
+    usable: Bool[np.ndarray, " photos"],
+    edges: Sequence[TableEdge],
+) -> _Offset | None:
+    """Return the LED's offset as the outlines of shadows show it; None if they do not, or contradict each other."""
+    found = outlines_of(stack, posed_camera, usable, edges)
+    if found is None:
+        return None
+    terms, trusted = found[0], found[0].trusted & carried.posed()
+    if trusted.sum() < MIN_VIEWS:
+        return None
+    terms = replace(terms, trusted=trusted)
+    offset, covariance = offset_by_outlines(terms, carried.poses, alone.flashlights.positions)
+    misfit = terms.misfit(_start(carried, alone.flashlights, offset).positions)[trusted]
+    return (offset, covariance) if led_is_beside(offset) and np.mean(misfit < DROP_OUTLINE) > AGREEING else None
+
+
 def _fit(
-    carried: _Carried, alone: FlashlightFit, views: PhoneViews, lens_error_mm: float
+    carried: _Carried, alone: FlashlightFit, views: PhoneViews, lens_error_mm: float, shown: _Offset | None
 ) -> tuple[FlashlightFit, float, Choice | None]:
     """Fit with the LED's offset given, fitted, or read from the phone's back; return also its error, mm, and choice.
 
-    A photo of the back is used after the shading, which distinguishes the main lens from the others and gives the
+    Where outlines contradict the shading, the tone curve or the beam is not what it is taken for: the outlines' offset
+    is taken. A photo of the back is used after these, which distinguish the main lens from the others and give the
     phone's orientation.
     """
     known = None if views.led_offset_mm is None else np.array(views.led_offset_mm)
     fit, error = _fit_offset(carried, alone, known), OFFSET_ERROR_MM[0 if known is None else 1]
-    if known is None and not led_is_beside(_led_offset(fit, carried)):  # the shading misleads: better none than this
+    shaded = _led_offset(fit, carried)
+    if known is None and shown is not None and _contradicts(shaded, shown):
+        fit, error = _fit_offset(carried, alone, shown[0]), float(np.sqrt(np.trace(shown[1])))
+    elif known is None and not led_is_beside(shaded):  # the shading misleads: better none than this
         fit, error = _fit_offset(carried, alone, np.zeros(3)), UNKNOWN_OFFSET_MM
     if views.back is None or known is not None:
         return fit, error, None
@@ -149,6 +185,12 @@ def _led_offset(fit: FlashlightFit, carried: _Carried) -> Float[np.ndarray, "3"]
     pose = carried.poses[k]
     assert pose is not None
     return pose.inverse().apply(fit.flashlights.positions[k])
+
+
+def _contradicts(shaded: Float[np.ndarray, "3"], shown: _Offset) -> bool:
+    """Return whether the offset that shading gives lies farther from the outlines' than both errors explain."""
+    spread = np.diag(np.full(3, FITTED_SIGMA**2))
+    return disagree(fuse([shaded, shown[0]], [spread, shown[1]])[2])
 
 
 def led_is_beside(offset: Float[np.ndarray, "3"]) -> bool:
