@@ -1,7 +1,8 @@
 """Locate the flashlight in each photo from the board as seen by the phone that carries it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from calibration.flashlight.led_offset import FITTED_SIGMA, QUARTER_TURNS, BackV
 from calibration.flashlight.light_estimate import LightFit, describe
 from calibration.flashlight.model import Flashlights, free_tangent
 from calibration.flashlight.outline_lights import outlines_of
-from calibration.flashlight.tone_curve import WORST_STEPS, compare_curves
+from calibration.flashlight.tone_curve import WORST_STEPS, ToneTest, compare_curves
 from calibration.flashlight.uncertainty import position_sigma, unseen_error
 from calibration.ground.table_edges import TableEdge
 from calibration.lights.fusion import disagree, fuse
@@ -104,9 +105,11 @@ def locate_lights_from_phone(
         raise _too_few(int(carried.posed().sum()), views)
     lens_error = lens.camera.sigmas["fx"] / lens.camera.fx * carried.reach  # a longer lens stands farther away
     shown = None if views.led_offset_mm else _shown_by_outlines(carried, alone, stack, posed_camera, usable, edges)
-    fit, offset_error, choice = _fit(carried, alone, views, float(np.median(lens_error[carried.posed()])), shown)
+    tone_of = partial(compare_curves, gains=np.array(stack.gains)[photos], is_linear=stack.is_linear)
+    middle_error = float(np.median(lens_error[carried.posed()]))
+    fit, offset_error, choice = _fit(carried, alone, views, middle_error, shown, tone_of)
     floor = np.where(carried.posed(), np.hypot(offset_error, lens_error), unseen_error(fit))
-    tone = compare_curves(fit, np.array(stack.gains)[photos], stack.is_linear)
+    tone = tone_of(fit)
     names, floor = [stack.paths[k].name for k in photos], np.hypot(floor, WORST_STEPS * tone.error())
     found = describe(fit, names, floor, *position_sigma(fit))
     residuals = (
@@ -150,18 +153,23 @@ def _shown_by_outlines(
 
 
 def _fit(
-    carried: _Carried, alone: FlashlightFit, views: PhoneViews, lens_error_mm: float, shown: _Offset | None
+    carried: _Carried,
+    alone: FlashlightFit,
+    views: PhoneViews,
+    lens_error_mm: float,
+    shown: _Offset | None,
+    tone_of: Callable[[FlashlightFit], ToneTest],
 ) -> tuple[FlashlightFit, float, Choice | None]:
     """Fit with the LED's offset given, fitted, or read from the phone's back; return also its error, mm, and choice.
 
-    Where outlines contradict the shading, the tone curve or the beam is not what it is taken for: the outlines' offset
-    is taken. A photo of the back is used after these, which distinguish the main lens from the others and give the
-    phone's orientation.
+    The outlines' offset is taken where it is the surer one, given how far other tone curves move the lights, and where
+    it contradicts the shading: then the tone curve or the beam is not what it is taken for. A photo of the back is used
+    after these, which distinguish the main lens from the others and give the phone's orientation.
     """
     known = None if views.led_offset_mm is None else np.array(views.led_offset_mm)
     fit, error = _fit_offset(carried, alone, known), OFFSET_ERROR_MM[0 if known is None else 1]
     shaded = _led_offset(fit, carried)
-    if known is None and shown is not None and _contradicts(shaded, shown):
+    if shown is not None and _is_surer(shown, shaded, float(np.hypot(error, np.median(tone_of(fit).error())))):
         fit, error = _fit_offset(carried, alone, shown[0]), float(np.sqrt(np.trace(shown[1])))
     elif known is None and not led_is_beside(shaded):  # the shading misleads: better none than this
         fit, error = _fit_offset(carried, alone, np.zeros(3)), UNKNOWN_OFFSET_MM
@@ -187,10 +195,14 @@ def _led_offset(fit: FlashlightFit, carried: _Carried) -> Float[np.ndarray, "3"]
     return pose.inverse().apply(fit.flashlights.positions[k])
 
 
-def _contradicts(shaded: Float[np.ndarray, "3"], shown: _Offset) -> bool:
-    """Return whether the offset that shading gives lies farther from the outlines' than both errors explain."""
+def _is_surer(shown: _Offset, shaded: Float[np.ndarray, "3"], error_mm: float) -> bool:
+    """Return whether outlines tell the offset better than shading, or contradict it by more than both errors explain.
+
+    Args:
+        error_mm: of the offset that shading gives.
+    """
     spread = np.diag(np.full(3, FITTED_SIGMA**2))
-    return disagree(fuse([shaded, shown[0]], [spread, shown[1]])[2])
+    return np.trace(shown[1]) < error_mm**2 or disagree(fuse([shaded, shown[0]], [spread, shown[1]])[2])
 
 
 def led_is_beside(offset: Float[np.ndarray, "3"]) -> bool:
