@@ -47,8 +47,7 @@ HULL, LIT_HULL = "shadow hull", "shadow hull, bent to the lights that reach it" 
 JUDGES_SEED = 1  # beside the seed, for the rays that judge the two surfaces: others than those that a level holds out
 # Single pixels, px and share of them: judged in blocks, at a lower sharpness, a relief lost a degree.
 JUDGES_BLOCK, JUDGES_SHARE = 1, 0.05
-CLEARLY = 0.85  # of the hull's shadow error: one made anew is taken below it; .79 was better
-LIT_CLEARLY = 0.9  # the same for one bent to lit pixels: a chair of .87 was much better, round bodies of .91 alike
+CLEARLY = 0.85  # of the hull's shadow error: one made anew, or bent to lit pixels, is taken below it; .79 was better
 JUDGES_SHARPNESS = 25.0  # NeuS s per voxel, as at the end of the solve
 CURVATURE = 0.1  # of the step size: the height field is smooth already
 
@@ -191,7 +190,7 @@ class HullStart:
         )
         if scene.rgb is None:
             errors = [self._shadow_error(grid, scene, observer) for grid in (hull, kept)]
-            self.name = LIT_HULL if errors[1] < LIT_CLEARLY * errors[0] else HULL
+            self.name = LIT_HULL if errors[1] < CLEARLY * errors[0] else HULL
             return kept if self.name == LIT_HULL else hull
         if len(scene.lights) >= LIGHTS_PER_NEED:
             return kept

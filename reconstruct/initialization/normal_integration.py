@@ -26,6 +26,7 @@ GUESSED_WIDTHS = (np.inf, 30.0, 9.0)  # of BREAK, for pairs with such a depth, i
 TOUCHING = 10.0  # times heavier when in front of a bound, where nothing can be, than behind it
 WRONG_BOUNDS = 0.05  # share of a hull's pixels that are behind the truth: edges, and beside thin matter that was lost
 HELD_FROM, HELD_ROUNDS = 32.0, 8  # pixels below which an error counts squared, at first; halved in each round, to 1
+GRAZING = 0.5  # cosine between ray and normal below which a normal says less of depth
 OWN_NORMAL = 0.03  # confidence of the surface's own normal where shading says nothing
 REACH = 2.0  # of the object's extent in the picture: how far normals carry a depth
 OUTLINE, OUTLINE_REACH = 2, 10.0  # pixels about an outline, where shadow edges hold the surface; reach of the normals
@@ -54,7 +55,7 @@ def follow_normals(
     Args:
         points: world, where each pixel's ray meets the grid's surface or the ground.
         own: world, the surface's normals there; 0 on the ground.
-        bounds: the surface is a shadow hull, which the object is behind.
+        bounds: the surface is a shadow hull: the object is never in front of it. See `integrate_behind`.
         bias: rad, of the labels' normals: their integral does not move what it explains.
 
     Returns:
@@ -65,7 +66,8 @@ def follow_normals(
         return grid, 0.0
     before, rays, seen = some.before, some.rays, np.isfinite(some.before)
     given = (rays, before, some.own, some.normals, some.trust)
-    after = integrate_behind(*given) if bounds else integrate_normals(*given)
+    is_lit = bounds and scene.rgb is None  # normals of which lights reach a pixel: rougher, but of 30 photos or more
+    after = integrate_behind(*given) if is_lit else integrate_normals(*given, bounds)
     after = before + _beyond_bias(after - before, before, rays, bias)
     part = (slice(None, None, some.step), slice(None, None, some.step))
     shown = torch.from_numpy(seen)
@@ -160,6 +162,8 @@ def integrate_behind(
     least squares of a tie lie at the dome's mean height; absolute errors that weigh more in front than behind lie at a
     quantile of the bounds [Koenker and Bassett, Regression Quantiles, Econometrica 46, 1978], which neither the dome's
     height nor a few wrong bounds move. They are solved by reweighting, from errors that are squared up to HELD_FROM.
+    A chord along a grazing ray is 1 / cosine longer, and so is what an error of its normal makes in depth: it weighs
+    the squared cosine, or it would draw what stands above to what lies below.
 
     Args:
         hull: t of the hull; nan where there is none.
@@ -167,7 +171,8 @@ def integrate_behind(
     """
     where = np.isfinite(hull)
     chords = _chords(rays, hull, own, normals, trust)
-    weight = np.where(np.abs(chords.apart) > BREAK, 0, chords.weight)
+    facing = np.minimum(chords.facing[chords.first], chords.facing[chords.second])
+    weight = np.where(np.abs(chords.apart) > BREAK, 0, chords.weight * np.minimum(facing / GRAZING, 1) ** 2)
     bound = cv2.erode(np.where(where, hull, np.inf), np.ones((3, 3)))[where]
     t, pull = hull[where], 1 / (REACH * _extent(where) * chords.size)
     for width in HELD_FROM / 2.0 ** np.arange(HELD_ROUNDS):
@@ -187,6 +192,7 @@ class _Chords:
     apart: Float[np.ndarray, " pairs"]  # pixels between the tangent planes of the present surface
     weight: Float[np.ndarray, " pairs"]
     size: Float[np.ndarray, " n"]  # of a pixel, world length
+    facing: Float[np.ndarray, " n"]  # cosine between a pixel's ray and normal
 
 
 def _chords(
@@ -215,7 +221,7 @@ def _chords(
     rows, ends = np.arange(len(p)), np.stack([q, p], -1).ravel()
     values = np.stack([(chord * d[q]).sum(1), -(chord * d[p]).sum(1)], -1)
     slope = csr_matrix((values.ravel(), (np.repeat(rows, 2), ends)), shape=(len(p), len(t0)))
-    return _Chords(p, q, slope, apart, weight, size)
+    return _Chords(p, q, slope, apart, weight, size, np.abs((n * d).sum(1)))
 
 
 def _reweighted(
@@ -227,7 +233,7 @@ def _reweighted(
     held: Float[np.ndarray, " n"],
     t: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:
-    """Return t after a round of least squares: Geman-McClure weights of a width, and ties of weight `hold` to `held`."""
+    """Return t after a round of least squares with Geman-McClure weights of a width, and ties of `hold` to `held`."""
     robust = weight / (1 + ((slope @ t - apart) / width) ** 2) ** 2
     matrix = slope.T @ diags(robust) @ slope + diags(hold)
     return _solved(csc_matrix(matrix), slope.T @ (robust * apart) + hold * held, t)
