@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.ndimage import binary_erosion
 
-from reconstruct.initialization.normal_integration import follow_normals, integrate_normals
+from reconstruct.initialization.normal_integration import follow_normals, integrate_behind, integrate_normals
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
 from reconstruct.sdf.grid import SdfGrid
@@ -78,6 +78,18 @@ def test_a_thing_before_another_is_not_drawn_to_it():
     found = integrate_normals(along, bulged, normals_of(along, bulged), normals, np.full(top.shape, SURE))
     inner = binary_erosion(truth.mask, iterations=2)
     assert np.abs(found - length)[inner].max() < 1.2 * PIXEL
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.02])
+def test_a_top_under_the_dome_of_a_hull_is_found_at_the_rim(block, wrong):
+    along, length, normals = rays_and_lengths(*block)
+    bulged, top = domed(length, block[1], 20.0)
+    bulged[~top] = np.nan
+    lost = top & (np.random.default_rng(0).random(top.shape) < wrong)
+    hull = np.where(lost, length + 20.0, bulged)
+    given = (along, hull, normals_of(along, bulged), normals, np.full(top.shape, SURE))
+    tied, behind = integrate_normals(*given, True), integrate_behind(*given)
+    assert np.abs(behind - length)[top].mean() < PIXEL < np.abs(tied - length)[top].mean()
 
 
 def test_what_is_in_front_of_a_hull_weighs_more(block):

@@ -183,7 +183,7 @@ class HullStart:
         bent by each in turn, a head of 50 mm became hollow. Under few lights the hull is bent as it is, and made anew
         behind the integral of the normals; the shadows on the ground decide, in doubt for the first. Shreds of an ear
         had an error of .016, the ear anew .013; a head before a body had .012, drawn to the body .039. Likewise for the
-        normals of shadow pictures: a dome over a flat top had an error of .094, bent .041; a round body .033 and .031.
+        normals of shadow pictures: a dome over a flat top had an error of .095, bent .062; a round body .033 and .030.
         """
         kept = self._rounds(
             hull, scene, observer, lambda now, seen, own: follow_normals(now, scene, *seen, own, True, _bias(scene))

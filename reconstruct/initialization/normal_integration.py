@@ -24,6 +24,9 @@ BREAK = 2.0  # pixels between the tangent planes of neighbours that are on diffe
 GUESSED = 2 * BREAK  # pixels of empty space before a depth that is a guess: its breaks are guesses, too
 GUESSED_WIDTHS = (np.inf, 30.0, 9.0)  # of BREAK, for pairs with such a depth, in rounds before the others
 TOUCHING = 10.0  # times heavier when in front of a bound, where nothing can be, than behind it
+WRONG_BOUNDS = 0.05  # share of a hull's pixels that are behind the truth: edges, and beside thin matter that was lost
+HELD_FROM, HELD_ROUNDS = 32.0, 8  # pixels below which an error counts squared, at first; halved in each round, to 1
+GRAZING = 0.5  # cosine between ray and normal below which a normal says less of depth
 OWN_NORMAL = 0.03  # confidence of the surface's own normal where shading says nothing
 REACH = 2.0  # of the object's extent in the picture: how far normals carry a depth
 OUTLINE, OUTLINE_REACH = 2, 10.0  # pixels about an outline, where shadow edges hold the surface; reach of the normals
@@ -52,7 +55,7 @@ def follow_normals(
     Args:
         points: world, where each pixel's ray meets the grid's surface or the ground.
         own: world, the surface's normals there; 0 on the ground.
-        bounds: the surface is a shadow hull: the object is never in front of it.
+        bounds: the surface is a shadow hull: the object is never in front of it. See `integrate_behind`.
         bias: rad, of the labels' normals: their integral does not move what it explains.
 
     Returns:
@@ -62,7 +65,9 @@ def follow_normals(
     if some is None:
         return grid, 0.0
     before, rays, seen = some.before, some.rays, np.isfinite(some.before)
-    after = integrate_normals(rays, before, some.own, some.normals, some.trust, bounds)
+    given = (rays, before, some.own, some.normals, some.trust)
+    is_lit = bounds and scene.rgb is None  # behind the hull of five photos in colour a figure's depth error doubled
+    after = integrate_behind(*given) if is_lit else integrate_normals(*given, bounds)
     after = before + _beyond_bias(after - before, before, rays, bias)
     part = (slice(None, None, some.step), slice(None, None, some.step))
     shown = torch.from_numpy(seen)
@@ -113,11 +118,9 @@ def integrate_normals(
 ) -> Float[np.ndarray, "height width"]:
     """Solve for ray lengths t from the eye, so that the surface t * ray has the given normals and stays near `before`.
 
-    Least squares over neighbouring pixels p, q of (n_p + n_q) / 2 . (t_q d_q - t_p d_p), in pixels of the picture: the
-    chord between two points of a curve is perpendicular to the mean of its normals there. The residual of the present
-    surface's own normals, at edges, is subtracted, so that a surface that already has the given normals does not move.
-    Pairs across a depth break of the present surface have no weight; Geman-McClure weights separate pairs where
-    shading shows a break. Each t is tied to its old value, loosely inside the object's outline.
+    Least squares over neighbouring pixels, see `_chords`. Pairs across a depth break of the present surface have no
+    weight; Geman-McClure weights separate pairs where shading shows a break. Each t is tied to its old value, loosely
+    inside the object's outline.
 
     Args:
         before: t of the present surface; nan where there is none.
@@ -129,31 +132,115 @@ def integrate_normals(
             narrow [graduated non-convexity: Blake and Zisserman, Visual Reconstruction, 1987].
     """
     where = np.isfinite(before)
+    t0 = before[where]
+    chords = _chords(rays, before, own, normals, trust)
+    first = t0 if front is None else np.minimum(front[where], t0)
+    guess = (t0 - first) / chords.size > GUESSED
+    guessed = guess[chords.first] | guess[chords.second]
+    broken = np.abs(chords.apart) > BREAK
+    apart = np.where(broken & guessed, 0, chords.apart)
+    weight = np.where(broken & ~guessed, 0, chords.weight)
+    tie = _tie(where, 0 if bounds else OUTLINE)[where] / chords.size**2
+    t = t0
+    for wider in (*(GUESSED_WIDTHS if guess.any() else ()), *(1.0 for _ in range(ROUNDS))):
+        hold = tie * np.where(t < first, TOUCHING if bounds else 1.0, 1.0)
+        t = _reweighted(chords.slope, apart, weight, BREAK * np.where(guessed, wider, 1.0), hold, t0, t)
+    return _spread(t, where)
+
+
+def integrate_behind(
+    rays: Float[np.ndarray, "height width 3"],
+    hull: Float[np.ndarray, "height width"],
+    own: Float[np.ndarray, "height width 3"],
+    normals: Float[np.ndarray, "height width 3"],
+    trust: Float[np.ndarray, "height width"],
+) -> Float[np.ndarray, "height width"]:
+    """Solve for ray lengths t, so that the surface t * ray has the given normals and lies behind a shadow hull.
+
+    As `integrate_normals`, but with what a hull says of depth: it is an outer bound, known to a pixel, and wrong at a
+    few pixels, where thin matter was lost. Over a flat top it is a dome, which touches the top at its rim alone. The
+    least squares of a tie lie at the dome's mean height; absolute errors that weigh more in front than behind lie at a
+    quantile of the bounds [Koenker and Bassett, Regression Quantiles, Econometrica 46, 1978], which neither the dome's
+    height nor a few wrong bounds move. They are solved by reweighting, from errors that are squared up to HELD_FROM.
+    A chord along a grazing ray is 1 / cosine longer, and so is what an error of its normal makes in depth: it weighs
+    the squared cosine, or it would draw what stands above to what lies below.
+
+    Args:
+        hull: t of the hull; nan where there is none.
+        own: its normals, which are used where the given ones are not trusted.
+    """
+    where = np.isfinite(hull)
+    chords = _chords(rays, hull, own, normals, trust)
+    facing = np.minimum(chords.facing[chords.first], chords.facing[chords.second])
+    weight = np.where(np.abs(chords.apart) > BREAK, 0, chords.weight * np.minimum(facing / GRAZING, 1) ** 2)
+    bound = cv2.erode(np.where(where, hull, np.inf), np.ones((3, 3)))[where]
+    t, pull = hull[where], 1 / (REACH * _extent(where) * chords.size)
+    for width in HELD_FROM / 2.0 ** np.arange(HELD_ROUNDS):
+        away = np.maximum(np.abs(t - bound), max(width, 1.0) * chords.size)
+        hold = pull * np.where(t < bound, 1.0, WRONG_BOUNDS) / away
+        t = _reweighted(chords.slope, chords.apart, weight, BREAK, hold, bound, t)
+    return _spread(t, where)
+
+
+@dataclass(frozen=True)
+class _Chords:
+    """The equations slope @ t = apart, one for each pair of neighbours."""
+
+    first: Int[np.ndarray, " pairs"]  # pixels of a pair, of those that are set
+    second: Int[np.ndarray, " pairs"]
+    slope: csr_matrix
+    apart: Float[np.ndarray, " pairs"]  # pixels between the tangent planes of the present surface
+    weight: Float[np.ndarray, " pairs"]
+    size: Float[np.ndarray, " n"]  # of a pixel, world length
+    facing: Float[np.ndarray, " n"]  # cosine between a pixel's ray and normal
+
+
+def _chords(
+    rays: Float[np.ndarray, "height width 3"],
+    before: Float[np.ndarray, "height width"],
+    own: Float[np.ndarray, "height width 3"],
+    normals: Float[np.ndarray, "height width 3"],
+    trust: Float[np.ndarray, "height width"],
+) -> _Chords:
+    """Return (n_p + n_q) / 2 . (t_q d_q - t_p d_p) of neighbouring pixels p, q, in pixels of the picture.
+
+    The chord between two points of a curve is perpendicular to the mean of its normals there. The residual of the
+    present surface's own normals, at edges, is to be subtracted, so that a surface that already has the given normals
+    does not move.
+    """
+    where = np.isfinite(before)
     d, t0, sure = rays[where].astype(np.float64), before[where], trust[where]
     n = np.where((sure > OWN_NORMAL)[:, None], normals[where], own[where]).astype(np.float64)
     p, q = _neighbours(where)
     size = np.median(np.linalg.norm(d[p] - d[q], axis=1)) * t0
-    first = t0 if front is None else np.minimum(front[where], t0)
-    guess = (t0 - first) / size > GUESSED
-    guessed = guess[p] | guess[q]
     worth = np.maximum(sure, OWN_NORMAL)
     weight = (worth[p] + worth[q]) / 2
     chord = (worth[p, None] * n[p] + worth[q, None] * n[q]) / (2 * weight * size[p])[:, None]
     own_chord = own[where][p] + own[where][q]
     apart = (own_chord * (t0[q, None] * d[q] - t0[p, None] * d[p])).sum(1) / (2 * size[p])
-    broken = np.abs(apart) > BREAK
-    apart[broken & guessed], weight[broken & ~guessed] = 0, 0
     rows, ends = np.arange(len(p)), np.stack([q, p], -1).ravel()
     values = np.stack([(chord * d[q]).sum(1), -(chord * d[p]).sum(1)], -1)
     slope = csr_matrix((values.ravel(), (np.repeat(rows, 2), ends)), shape=(len(p), len(t0)))
-    tie = _tie(where, 0 if bounds else OUTLINE)[where] / size**2
-    t = t0
-    for wider in (*(GUESSED_WIDTHS if guess.any() else ()), *(1.0 for _ in range(ROUNDS))):
-        width = BREAK * np.where(guessed, wider, 1.0)
-        robust = weight / (1 + ((slope @ t - apart) / width) ** 2) ** 2
-        hold = tie * np.where(t < first, TOUCHING if bounds else 1.0, 1.0)
-        matrix = slope.T @ diags(robust) @ slope + diags(hold)
-        t = _solved(csc_matrix(matrix), slope.T @ (robust * apart) + hold * t0, t)
+    return _Chords(p, q, slope, apart, weight, size, np.abs((n * d).sum(1)))
+
+
+def _reweighted(
+    slope: csr_matrix,
+    apart: Float[np.ndarray, " pairs"],
+    weight: Float[np.ndarray, " pairs"],
+    width: float | Float[np.ndarray, " pairs"],
+    hold: Float[np.ndarray, " n"],
+    held: Float[np.ndarray, " n"],
+    t: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, " n"]:
+    """Return t after a round of least squares with Geman-McClure weights of a width, and ties of `hold` to `held`."""
+    robust = weight / (1 + ((slope @ t - apart) / width) ** 2) ** 2
+    matrix = slope.T @ diags(robust) @ slope + diags(hold)
+    return _solved(csc_matrix(matrix), slope.T @ (robust * apart) + hold * held, t)
+
+
+def _spread(t: Float[np.ndarray, " n"], where: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Return an image of t, nan elsewhere."""
     result = np.full(where.shape, np.nan)
     result[where] = t
     return result
@@ -189,9 +276,13 @@ def _beyond_bias(
 
 def _tie(where: Bool[np.ndarray, "height width"], outline: int) -> Float[np.ndarray, "height width"]:
     """Return the weight of a pixel's tie to its old depth, per squared pixel."""
-    extent = max(np.ptp(axis) for axis in np.nonzero(where)) + 1
     inner = cv2.erode(where.astype(np.uint8), np.ones((2 * outline + 1, 2 * outline + 1)), borderValue=0)
-    return np.where(inner > 0, 1 / (REACH * extent) ** 2, 1 / OUTLINE_REACH**2)
+    return np.where(inner > 0, 1 / (REACH * _extent(where)) ** 2, 1 / OUTLINE_REACH**2)
+
+
+def _extent(where: Bool[np.ndarray, "height width"]) -> int:
+    """Return the longer side of what is set, pixels."""
+    return max(int(np.ptp(axis)) for axis in np.nonzero(where)) + 1
 
 
 def _neighbours(where: Bool[np.ndarray, "height width"]) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
