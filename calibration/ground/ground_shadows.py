@@ -172,13 +172,19 @@ def _with_plinth(
         strip = parts == number
         if number == 0 or _extent(strip) < widest:
             continue
-        hull = np.zeros(chosen.shape, np.uint8)
-        cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(strip)[:, ::-1].astype(np.int32)), 1)
-        near, is_bent = cv2.dilate(hull, disc) > 0, hull.sum() > BENT * strip.sum()
-        if is_bent and chosen[hull > 0].any():
-            both = cv2.morphologyEx((found | (hull > 0)).astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
-            found |= (both & near) | (hull > 0)
+        hull = convex_hull(strip)
+        near, is_bent = cv2.dilate(hull.astype(np.uint8), disc) > 0, hull.sum() > BENT * strip.sum()
+        if is_bent and chosen[hull].any():
+            both = cv2.morphologyEx((found | hull).astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
+            found |= (both & near) | hull
     return np.asarray(binary_fill_holes(found))
+
+
+def convex_hull(region: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """Return the pixels inside the convex hull of a region that is not empty."""
+    hull = np.zeros(region.shape, np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(region)[:, ::-1].astype(np.int32)), 1)
+    return hull > 0
 
 
 def _extent(region: Bool[np.ndarray, "height width"]) -> int:
