@@ -102,3 +102,14 @@ def test_ground_that_shadows_of_single_photos_enclose_stays_ground():
     between = (np.abs(COLUMNS - 80) < 3) & (ROWS > 43) & (ROWS < 49)
     assert not (field.residual[:, between] < -1).any()
     assert not find_shadows(field).object_mask[between].any()
+
+
+def test_print_that_is_too_dark_to_show_shadows_stays_ground():
+    """A black square in the shadow of three photos: no part of the object borders it."""
+    figure = (np.abs(COLUMNS - 50) < 10) & (ROWS > 40) & (ROWS < 80)
+    square = (np.abs(COLUMNS - 90) < 6) & (np.abs(ROWS - 60) < 6)
+    field = _field(figure)
+    for residual in field.residual[:3]:
+        residual[(np.abs(ROWS - 60) < 15) & (COLUMNS > 58) & (COLUMNS < 110) & ~square & ~figure] = -2.0
+    found = find_shadows(field).object_mask
+    assert found[figure].mean() > 0.9 and not found[square].any()

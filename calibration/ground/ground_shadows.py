@@ -27,6 +27,7 @@ LINE_GAP = 5  # px: shorter gaps in a line across the picture are closed
 SEAM_LENGTH, SEAM_WIDTH = 0.12, 0.025  # of the picture's long side: a line this long and thin may be a wall's foot
 NEIGHBOURS = np.ones((3, 3), np.uint8)  # of a pixel, and itself
 RIM = np.ones((7, 7), np.uint8)  # around a hole: where the ground beside it is looked at, two pixels wide
+FRONT = 0.25  # of a top's rim, seen from above: its near edge is a third or more
 RIM_PHOTOS = 2  # photos that show the ground behind a top in shadow, at least
 
 
@@ -65,9 +66,9 @@ def level_tops(
     """Return the object's level tops: they are lit as the ground is, but the object and its shadows enclose them.
 
     A top is a hole in what is unlike the ground, or in that together with the shadows of all photos, and no wider than
-    the object. Shadows alone enclose ground, too: those of a thick head on a thin neck meet behind it. There the hole's
-    rim is the edge of single shadows. Behind a top the ground is hidden from many lights: half of the rim, or more, is
-    dark in RIM_PHOTOS photos.
+    the object. Shadows alone enclose ground, too, as those of a thick head on a thin neck that meet behind it, or what
+    is too dark to show them, as print. A top has the object's side below it, towards the camera: FRONT of its rim, or
+    more. Behind it the ground is hidden from many lights: half of the rest of the rim is dark in RIM_PHOTOS photos.
 
     Args:
         likelihood: mean log likelihood ratio, object over ground.
@@ -89,8 +90,10 @@ def level_tops(
             around = tuple(slice(max(side.start - len(RIM), 0), side.stop + len(RIM)) for side in box)
             hole = (holes[around] == number).astype(np.uint8)
             edge = cv2.dilate(hole, NEIGHBOURS) > 0
-            rim = (cv2.dilate(hole, RIM) > 0) & ~edge & ~unlike[around]
-            if not rim.any() or np.median(dark[around][rim]) >= RIM_PHOTOS:
+            rim = (cv2.dilate(hole, RIM) > 0) & ~edge
+            behind = rim & ~unlike[around]
+            has_front = (~behind | mask[around])[rim].mean() > FRONT
+            if has_front and (not behind.any() or np.median(dark[around][behind]) >= RIM_PHOTOS):
                 found[around] |= edge
     return found
 
