@@ -78,11 +78,9 @@ def level_tops(
     found = np.zeros(mask.shape, bool)
     if not mask.any():
         return found
-    unlike, widest = _closed(likelihood > GROUND_LIKE), _extent(mask)
-    for ring in (unlike, _closed(unlike | (dark > 0))):
-        parts, holes = np.empty(mask.shape, np.int32), np.empty(mask.shape, np.int32)
-        label(ring | mask, NEIGHBOURS, output=parts)
-        whole = np.isin(parts, parts[mask])
+    unlike, widest, holes = _closed(likelihood > GROUND_LIKE), _extent(mask), np.empty(mask.shape, np.int32)
+    seen = _joined(mask, unlike)
+    for whole in (seen, _joined(mask, _closed(unlike | (dark > 0)))):
         label(np.asarray(binary_fill_holes(whole)) & ~whole, output=holes)
         for number, box in enumerate(find_objects(holes), 1):
             if max(side.stop - side.start for side in box) > widest:
@@ -92,10 +90,19 @@ def level_tops(
             edge = cv2.dilate(hole, NEIGHBOURS) > 0
             rim = (cv2.dilate(hole, RIM) > 0) & ~edge
             behind = rim & ~unlike[around]
-            has_front = (~behind | mask[around])[rim].mean() > FRONT
+            has_front = seen[around][rim].mean() > FRONT
             if has_front and (not behind.any() or np.median(dark[around][behind]) >= RIM_PHOTOS):
                 found[around] |= edge
     return found
+
+
+def _joined(
+    mask: Bool[np.ndarray, "height width"], region: Bool[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """Return the mask with all of the region that hangs together with it."""
+    parts = np.empty(mask.shape, np.int32)
+    label(region | mask, NEIGHBOURS, output=parts)
+    return np.isin(parts, parts[mask])
 
 
 def _closed(region: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
