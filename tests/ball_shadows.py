@@ -39,8 +39,8 @@ def hits_ball(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.cross(MIDDLE - start, along), axis=-1) < RADIUS
 
 
-def drawn():
-    """Return camera, lights and maps."""
+def photographed() -> tuple[PosedCamera, np.ndarray, GroundField, GroundShadows]:
+    """Return camera, lights, and what is seen of the ground."""
     camera, lights = ball_camera(), ball_lights()
     points, _ = ground_points(camera)
     mask = hits_ball(np.broadcast_to(EYE, points.shape), points)
@@ -49,7 +49,17 @@ def drawn():
     every = np.ones(lit.shape, bool)
     field = GroundField(flat, np.zeros(lit.shape, np.float32), np.where(lit, 0, -2).astype(np.float32), every, flat + 1)
     likelihood = np.where(mask, 1.0, -1.0).astype(np.float32)
-    shadows = GroundShadows(lit.astype(np.float32), np.full(len(lights), -2.0), likelihood, mask)
+    return (
+        camera,
+        lights,
+        field,
+        GroundShadows(lit.astype(np.float32), np.full(len(lights), -2.0), likelihood, mask),
+    )
+
+
+def drawn():
+    """Return camera, lights and maps."""
+    camera, lights, field, shadows = photographed()
     maps = outline_maps(field, shadows, camera)
     assert maps is not None
     return camera, lights, maps

@@ -68,3 +68,48 @@ def test_lights_whose_stated_error_is_large_are_notsurely_placed():
         for k, (place, sigma) in enumerate(zip(places, sigmas, strict=True))
     )
     assert surely_placed(LightFit(lights, (), np.zeros(3)), np.zeros(3)) == 0.5
+
+
+def _around_a_disc(shadows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A low disc: its top, its front, and what is found of both; each photo shows one of the shadows."""
+    top = ((COLUMNS - 80) / 20) ** 2 + ((ROWS - 60) / 9) ** 2 < 1
+    body = top | (((COLUMNS - 80) / 20) ** 2 + ((ROWS - 67) / 9) ** 2 < 1) | ((np.abs(COLUMNS - 80) < 20) & top)
+    front = body & ~top & (ROWS > 60)
+    field = _field(front)
+    for residual, shadow in zip(field.residual, shadows, strict=True):
+        residual[shadow & ~body] = -2.0
+    return top, front, find_shadows(field).object_mask
+
+
+def test_the_level_top_of_a_low_object_is_what_its_front_and_its_shadows_enclose():
+    def shadow(right: int, up: int) -> np.ndarray:
+        return ((COLUMNS - 80 - right) / 20) ** 2 + ((ROWS - 64 + up) / 9) ** 2 < 1
+
+    cast = [shadow(*away) for away in ((-12, 2), (-8, 8), (-3, 10), (3, 10), (8, 8), (12, 2))]
+    top, front, found = _around_a_disc(cast)
+    assert found[top].mean() > 0.95 and found[front].mean() > 0.9
+    assert (found & ~top & ~front).sum() < 0.15 * (top | front).sum()
+
+
+def test_ground_that_shadows_of_single_photos_enclose_stays_ground():
+    """Shadows of a thick head on a thin neck meet behind the object, each seen in one photo."""
+    figure = (np.abs(COLUMNS - 80) < 8) & (ROWS > 56) & (ROWS < 110)
+    field = _field(figure)
+    for residual, side in zip(field.residual, (-1, 1), strict=False):
+        head = (ROWS - 24) ** 2 + (COLUMNS - 80 - 25 * side) ** 2 < 27**2
+        neck = (np.abs(COLUMNS - 80 - 25 * side * (60 - ROWS) / 36) < 3) & (ROWS > 24) & (ROWS < 62)
+        residual[(head | neck) & ~figure] = -2.0
+    between = (np.abs(COLUMNS - 80) < 3) & (ROWS > 43) & (ROWS < 49)
+    assert not (field.residual[:, between] < -1).any()
+    assert not find_shadows(field).object_mask[between].any()
+
+
+def test_print_that_is_too_dark_to_show_shadows_stays_ground():
+    """A black square in the shadow of three photos: no part of the object borders it."""
+    figure = (np.abs(COLUMNS - 50) < 10) & (ROWS > 40) & (ROWS < 80)
+    square = (np.abs(COLUMNS - 90) < 6) & (np.abs(ROWS - 60) < 6)
+    field = _field(figure)
+    for residual in field.residual[:3]:
+        residual[(np.abs(ROWS - 60) < 15) & (COLUMNS > 58) & (COLUMNS < 110) & ~square & ~figure] = -2.0
+    found = find_shadows(field).object_mask
+    assert found[figure].mean() > 0.9 and not found[square].any()

@@ -2,15 +2,17 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
-from ball_shadows import EYE, HEIGHT, MIDDLE, RADIUS, WIDTH, ball_camera, drawn, hits_ball
+from ball_shadows import EYE, HEIGHT, MIDDLE, RADIUS, WIDTH, ball_camera, drawn, hits_ball, photographed
 from flashlight_photos import looking_at
 
 from calibration.flashlight import common_motion
 from calibration.flashlight.common_motion import same_shadows
 from calibration.flashlight.fit import FlashlightFit
 from calibration.flashlight.model import Evidence, Flashlights, free_tangent
+from calibration.flashlight.outline_lights import OUTLINES_WRONG
 from calibration.ground.ground_field import GroundField, fit_ground_field
 from calibration.ground.ground_shadows import GroundShadows, find_shadows, without_seams
 from calibration.ground.mirror_highlights import MirrorHighlights, find_highlights
@@ -21,7 +23,7 @@ from calibration.outlines.metric_cues import MetricCues
 from calibration.outlines.outline_maps import PIXEL_ERROR, outline_maps, with_cues
 from calibration.outlines.relocate import likely_places
 from calibration.outlines.shadow_start import STARTS, shadow_starts
-from calibration.outlines.terms import FALSE_SPOT, OutlineTerms
+from calibration.outlines.terms import DROP_OUTLINE, FALSE_SPOT, OutlineTerms
 from calibration.pose import Pose
 from calibration.side_view import SideView
 
@@ -211,24 +213,30 @@ def test_starts_are_of_several_heights(ball):
     assert all(np.abs(one - starts[0]).max() > 1 for one in starts[1:])
 
 
-def test_samples_too_dark_to_be_measured_are_shadow(ball):
+def test_samples_too_dark_to_be_measured_are_shadow():
     """The rim of a sharpened shadow is black; without it every shadow would seem to go on in the unknown."""
-    camera, lights, _ = ball
-    points, _ = ground_points(camera)
-    mask = hits_ball(np.broadcast_to(EYE, points.shape), points)
-    lit = np.stack([~hits_ball(points, light) for light in lights])
+    camera, _, field, shadows = photographed()
+    lit = shadows.visibility > 0.5
     measured = lit | (np.random.default_rng(0).random(lit.shape) < 0.7)
-    flat = np.zeros((HEIGHT, WIDTH), np.float32)
-    residual = np.where(lit, 0, -2).astype(np.float32)
-    field = GroundField(flat, np.zeros(lit.shape, np.float32), residual, measured, flat + 1)
-    likelihood = np.where(mask, 1.0, -1.0).astype(np.float32)
-    shadows = GroundShadows(lit.astype(np.float32), np.full(len(lights), -2.0), likelihood, mask)
-    maps, whole = (
-        outline_maps(one, shadows, camera) for one in (field, replace(field, usable=np.ones(lit.shape, bool)))
-    )
+    maps, whole = (outline_maps(one, shadows, camera) for one in (replace(field, usable=measured), field))
     assert maps is not None and whole is not None
     np.testing.assert_array_equal(maps.is_cut, whole.is_cut)
     np.testing.assert_array_equal(maps.dark, whole.dark)
+
+
+def test_a_part_that_is_lit_as_the_ground_is_makes_right_lights_contradict_unless_the_hull_is_unknown():
+    """All of the ball but its rim is taken for lit ground."""
+    camera, lights, field, shadows = photographed()
+    inside = cv2.erode(shadows.object_mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    likelihood = np.where(inside, -1.0, shadows.likelihood).astype(np.float32)
+    wrong = replace(shadows, visibility=np.where(inside, np.float32(1), shadows.visibility), likelihood=likelihood)
+    wrong = replace(wrong, object_mask=shadows.object_mask & ~inside)
+    every = np.ones(len(lights), bool)
+    tight, wide = (outline_maps(field, wrong, camera, unknown) for unknown in (False, True))
+    assert tight is not None and wide is not None
+    misfit = [OutlineTerms(maps, EYE, 0.0, every, every).misfit(lights) for maps in (tight, wide)]
+    assert (misfit[0] > DROP_OUTLINE).mean() > OUTLINES_WRONG
+    assert np.median(misfit[1]) < 0.3 and (misfit[1] < DROP_OUTLINE).all()
 
 
 def test_the_homology_of_lights_changes_no_shadow(ball):

@@ -18,7 +18,7 @@ from calibration.flashlight.model import (
     free_tangent,
     log_irradiance,
 )
-from calibration.flashlight.uncertainty import unseen_error
+from calibration.flashlight.uncertainty import beam_error, unseen_error
 from calibration.light import beam_gain, irradiance
 from calibration.lights.ground_cells import sample_ground
 from calibration.posed_camera import PosedCamera
@@ -190,3 +190,20 @@ def test_a_light_whose_power_stands_out_is_less_sure_of_its_distance(truth):
     distance = np.linalg.norm(start.positions - evidence.cells.centre, axis=1)
     np.testing.assert_allclose(grown[1:], 0.0, atol=1e-6)
     assert np.sqrt(grown[0]) == pytest.approx(0.04 * distance[0], rel=1e-3)
+
+
+def test_a_hot_beam_misplaces_all_lights_together_and_the_error_of_the_beam_tells(truth):
+    """A hot centre, 40 % brighter within some 20 degrees of the axis, that a smooth beam cannot follow."""
+    evidence, _ = collect(truth.stack, POSED_CAMERA, every(truth.stack))
+    where, axes = (np.array([getattr(k, name) for k in truth.lights]) for name in ("position", "axis"))
+    toward = evidence.cells.points[None] - where[:, None]
+    cosine = np.einsum("kjx,kx->kj", toward / np.linalg.norm(toward, axis=-1, keepdims=True), axes)
+    hot = replace(evidence, log_grey=evidence.log_grey + 0.35 * np.exp(-(((1 - cosine) / 0.05) ** 2)))
+    errors, told = [], []
+    for one in (evidence, hot):
+        fit = fit_flashlights(first_guess(one), one, free_tangent)
+        errors.append(np.linalg.norm(fit.flashlights.positions - where, axis=1))
+        told.append(beam_error(fit))
+    assert np.median(errors[1]) > 5 * np.median(errors[0])
+    assert (errors[1] < told[1]).mean() >= 0.9
+    assert np.median(told[0]) < 0.2 * np.median(told[1])

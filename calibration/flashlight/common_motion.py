@@ -149,7 +149,7 @@ def at_best_contrast(start: Flashlights, evidence: Evidence, contrasts: tuple[fl
     assert evidence.outlines is not None
     found = [_joint(start.positions, _flattened(evidence, one), USUAL_MISFIT, LOOSE, start)[1:] for one in contrasts]
     shown = np.array([one * misfit for one, (_, misfit) in zip(contrasts, found, strict=True)])  # in the pictures
-    cells = _independent_cells(_trusted(evidence, USUAL_MISFIT).weight, float(np.median(shown)))
+    cells = _independent_cells(_weighted(evidence, USUAL_MISFIT).weight, float(np.median(shown)))
     surprise = np.log(contrasts) / CONTRAST_WIDTH
     outlines = [evidence.outlines.cost(fit.flashlights.positions) for fit, _ in found]
     cost = np.array(outlines) + cells * np.log(shown) + 0.5 * surprise**2
@@ -168,9 +168,9 @@ def _flattened(evidence: Evidence, contrast: float) -> Evidence:
 
 def _as_pictured(fit: FlashlightFit, evidence: Evidence) -> FlashlightFit:
     """Fit beam, aims and powers to the evidence with the places held, so that they say what the pictures show."""
-    trusted = _trusted(evidence, USUAL_MISFIT)
-    flashlights, weight = _held(fit.flashlights.positions, trusted, fit.flashlights)
-    misfit = spread(cell_residuals(flashlights, trusted, weight)[trusted.weight > 0])
+    weighted = _weighted(evidence, USUAL_MISFIT)
+    flashlights, weight = _held(fit.flashlights.positions, weighted, fit.flashlights)
+    misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
     return replace(fit, flashlights=flashlights, weight=weight, evidence=_weighted(evidence, misfit))
 
 
@@ -230,11 +230,11 @@ def same_shadows(
 def _joint(
     places: Float[np.ndarray, "photos 3"], evidence: Evidence, misfit: float, priors: Priors, like: Flashlights
 ) -> _Found:
-    """Fit all trusted photos from given places; return the negative log posterior, the fit and the shading's misfit.
+    """Fit from given places near the answer; return the negative log posterior, the fit and the shading's misfit.
 
-    The fit's evidence has the shading of all photos.
+    Shading alone places the photos whose outlines are not trusted.
     """
-    weighted = _trusted(evidence, misfit)
+    weighted = _weighted(evidence, misfit)
     return _settled(_held(places, weighted, like)[0], evidence, weighted, priors)
 
 

@@ -31,7 +31,7 @@ from calibration.flashlight.model import (
 )
 from calibration.flashlight.outline_lights import OUTLINE_SIDE, outline_sigma, with_outlines
 from calibration.flashlight.tone_curve import WORST_STEPS, compare_curves
-from calibration.flashlight.uncertainty import position_sigma, unseen_error
+from calibration.flashlight.uncertainty import beam_error, position_sigma, unseen_error
 from calibration.light import Light, Vector
 from calibration.lights.ground_cells import ground_ends
 from calibration.lights.power import albedo_scale
@@ -49,6 +49,10 @@ LARGEST_SIGMA = 0.08  # of the range, before HONEST_SHARE
 LARGEST_JOINT_SIGMA = 0.25  # of lights from outlines and shading: the solver's shadow rays take over from there
 FEWEST_USED = 2 / 3  # of the photos that shading alone must place
 BY_SHADING = "lights: from the ground's shading alone"
+BY_DOUBTED_SHADING = (
+    BY_SHADING + ", which contradicts itself: this phone or flashlight changes brightness from place to place. Expect "
+    "errors of {:.0%} of a light's distance; photos in light/, or RAW photos, make them exact"
+)
 BY_OUTLINES = (
     "lights: from the outlines of shadows and object, their common scale from the shading of all photos. This phone or "
     "flashlight changes brightness from place to place, so shading alone would misplace them. Expect errors of a tenth "
@@ -214,6 +218,19 @@ def surely_placed(found: LightFit, centre: Float[np.ndarray, "3"]) -> float:
     return float(np.mean(np.array([light.used for light in found.lights]) & (sigma < LARGEST_SIGMA * reach)))
 
 
+def _doubted(found: LightFit, fit: FlashlightFit) -> LightFit:
+    """Return the lights with the error that a beam with rings may cause added to their sigmas, and told as the cue."""
+    error = beam_error(fit)
+    lights = tuple(
+        replace(light, sigma=np.hypot(light.sigma, one / np.sqrt(3)))
+        for light, one in zip(found.lights, error, strict=True)
+    )
+    reach = np.linalg.norm(fit.flashlights.positions - fit.evidence.cells.centre, axis=1)
+    size = np.linalg.norm([light.sigma for light in lights], axis=1) / reach
+    cue = BY_DOUBTED_SHADING.format(float(np.median(size)))
+    return replace(found, lights=lights, residuals=found.residuals | {"cue": cue})
+
+
 def told_doubt(fit: FlashlightFit) -> str:
     """Return what to add to the sentence about the lights where fits that are about as likely lie far apart, or ""."""
     reach = np.linalg.norm(fit.flashlights.positions - fit.evidence.cells.centre, axis=1)
@@ -254,11 +271,10 @@ def locate_lights(
     floor = np.hypot(unseen_error(fit), WORST_STEPS * tone.error())
     found = describe(fit, names, floor, *position_sigma(fit))
     found = replace(found, residuals=found.residuals | {"tone": tone.document(), "cue": BY_SHADING})
-    joint = (
-        None
-        if surely_placed(found, evidence.cells.centre) >= FEWEST_USED
-        else with_outlines(evidence, stack, posed_camera, usable, fit.flashlights.positions, edges, cues)
-    )
+    if surely_placed(found, evidence.cells.centre) >= FEWEST_USED:
+        return found
+    found = _doubted(found, fit)
+    joint = with_outlines(evidence, stack, posed_camera, usable, fit.flashlights.positions, edges, cues)
     if joint is None:
         return found
     sigma = outline_sigma(joint)

@@ -30,7 +30,7 @@ from calibration.flashlight.model import (
     normal_equations,
     refine,
 )
-from calibration.ground.ground_field import at_photo_size, fit_ground_field
+from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows, find_shadows, of_one_ground
 from calibration.ground.mirror_highlights import find_highlights
 from calibration.ground.table_edges import TableEdge
@@ -50,6 +50,8 @@ UNUSUAL = 2.0  # sigmas of a distance from which a light is looked for again
 ROUNDS = 3  # in which lights are located among those that are known by then, at most
 TRIED = 3  # likely places of a stray light that are fitted to outlines and shading
 FEWEST_WHOLE = 8  # photos whose shadows the picture does not cut
+OUTLINES_WRONG = 1 / 3  # of the trusted photos at odds: more than are ever bad, so the object's outline is wrong, ...
+REPAIRED = 0.5  # ... and its hull is right if it leaves less than this share of them at odds
 LEAST_SHADOWS = 0.5  # of the photos that must show a shadow
 ROUNDED = 0.03  # of the range: what neither outlines nor shading show
 HONEST = 1.7  # errors over formal sigmas on rendered captures, at most: a motion that all lights share is not all seen
@@ -73,18 +75,20 @@ def with_outlines(
         edges: where the ground ends, world: no shadow beyond them is looked at.
         cues: photos from the side, a height: they fix the numbers that outlines leave free.
     """
-    found = outlines_of(stack, posed_camera, photos, edges, cues)
-    if found is None:
+    coarse, field, shadows = _ground_and_shadows(stack, posed_camera, photos, edges)
+    terms = _terms(coarse, field, shadows, posed_camera, cues)
+    if terms is None:
         return None
-    terms, shadows = found
-    whole = terms.trusted
-    starts = shadow_starts(terms.maps, shadows.object_mask, posed_camera)
+    starts = [*shadow_starts(terms.maps, shadows.object_mask, posed_camera), by_shading]
     cells = replace(_lit_cells(evidence, shadows, posed_camera), outlines=terms)
-    starts.append(by_shading)
     fit, number = searched(starts, cells)
+    wide = _terms(coarse, field, shadows, posed_camera, cues, True) if _at_odds(fit, terms) > OUTLINES_WRONG else None
+    if wide is not None and _at_odds(fit, wide) < REPAIRED * _at_odds(fit, terms):
+        terms = wide
+        fit, number = searched(starts, replace(cells, outlines=wide))
     if _ground(fit) < MIN_GROUND / THIN:
         return None
-    complete = _with_strays(fit, starts[number], by_shading, whole)
+    complete = _with_strays(fit, starts[number], by_shading, terms.trusted)
     # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share
     contrasts = (1.0,) if stack.is_linear else CONTRASTS
     found = at_best_contrast(complete.flashlights, replace(cells, outlines=complete.evidence.outlines), contrasts)
@@ -92,30 +96,49 @@ def with_outlines(
 
 
 def outlines_of(
-    stack: PhotoStack,
-    posed_camera: PosedCamera,
-    photos: Bool[np.ndarray, " photos"],
-    edges: Sequence[TableEdge] = (),
-    cues: MetricCues = NO_CUES,
-) -> tuple[OutlineTerms, GroundShadows] | None:
-    """Return the outlines in these photos of the stack, those that the picture does not cut trusted, and the shadows.
+    stack: PhotoStack, posed_camera: PosedCamera, photos: Bool[np.ndarray, " photos"], edges: Sequence[TableEdge] = ()
+) -> OutlineTerms | None:
+    """Return the outlines in these photos of the stack, those trusted that the picture does not cut.
 
     None without an object or enough shadows. Arguments as of with_outlines.
     """
+    return _terms(*_ground_and_shadows(stack, posed_camera, photos, edges), posed_camera, NO_CUES)
+
+
+def _ground_and_shadows(
+    stack: PhotoStack, posed_camera: PosedCamera, photos: Bool[np.ndarray, " photos"], edges: Sequence[TableEdge]
+) -> tuple[GroundField, GroundField, GroundShadows]:
+    """Return the ground's field, coarse and as sharp as outlines need it, and the shadows on it."""
     rgb, usable = stack.rgb[photos], ~stack.clipped[photos]
     coarse = fit_ground_field(rgb, usable, beyond_ends(edges, posed_camera, rgb.shape[1:3]))
     field = at_photo_size(coarse, rgb, usable, OUTLINE_SIDE)
-    shadows = of_one_ground(find_shadows(field))
-    maps = outline_maps(field, shadows, posed_camera)
+    return coarse, field, of_one_ground(find_shadows(field))
+
+
+def _terms(
+    coarse: GroundField,
+    field: GroundField,
+    shadows: GroundShadows,
+    posed_camera: PosedCamera,
+    cues: MetricCues,
+    is_hull_unknown: bool = False,
+) -> OutlineTerms | None:
+    """Return the outlines of all photos, those trusted that the picture does not cut; None with too few shadows."""
+    maps = outline_maps(field, shadows, posed_camera, is_hull_unknown)
     if maps is None or len(np.unique(maps.owner)) < LEAST_SHADOWS * maps.n_photos():
         return None
     maps = with_cues(maps, cues, posed_camera)
     every = np.ones(maps.n_photos(), bool)
     whole = ~maps.is_cut & np.isin(np.arange(maps.n_photos()), maps.owner)
-    whole = whole if whole.sum() >= FEWEST_WHOLE else every
     points, near = near_ground(maps, posed_camera, coarse.albedo.shape)
     spots = find_highlights(coarse, find_shadows(coarse), points, near)
-    return OutlineTerms(maps, posed_camera.centre, posed_camera.ground_height, every, whole, spots), shadows
+    trusted = whole if whole.sum() >= FEWEST_WHOLE else every
+    return OutlineTerms(maps, posed_camera.centre, posed_camera.ground_height, every, trusted, spots)
+
+
+def _at_odds(fit: FlashlightFit, terms: OutlineTerms) -> float:
+    """Return the share of the trusted photos whose shadows contradict the others', with the lights where they are."""
+    return float((terms.misfit(fit.flashlights.positions) > DROP_OUTLINE)[terms.trusted].mean())
 
 
 def _ground(fit: FlashlightFit) -> int:

@@ -140,11 +140,8 @@ def _shown_by_outlines(
     edges: Sequence[TableEdge],
 ) -> _Offset | None:
     """Return the LED's offset as the outlines of shadows show it; None if they do not, or contradict each other."""
-    found = outlines_of(stack, posed_camera, usable, edges)
-    if found is None:
-        return None
-    terms, trusted = found[0], found[0].trusted & carried.posed()
-    if trusted.sum() < MIN_VIEWS:
+    terms = outlines_of(stack, posed_camera, usable, edges)
+    if terms is None or (trusted := terms.trusted & carried.posed()).sum() < MIN_VIEWS:
         return None
     terms = replace(terms, trusted=trusted)
     offset, covariance = offset_by_outlines(terms, carried.poses, alone.flashlights.positions)

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.ndimage import binary_fill_holes, label
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import binary_fill_holes, find_objects, label
 
 from calibration.ground.ground_field import GroundField, Maps
 
@@ -25,6 +25,10 @@ BENT = 1.5  # area of the convex hull of a plinth's side over its own; of a wall
 SEAM = 0.006  # of the picture's long side, to both sides of the line where the ground ends
 LINE_GAP = 5  # px: shorter gaps in a line across the picture are closed
 SEAM_LENGTH, SEAM_WIDTH = 0.12, 0.025  # of the picture's long side: a line this long and thin may be a wall's foot
+NEIGHBOURS = np.ones((3, 3), np.uint8)  # of a pixel, and itself
+RIM = np.ones((7, 7), np.uint8)  # around a hole: where the ground beside it is looked at, two pixels wide
+FRONT = 0.25  # of a top's rim, seen from above: its near edge is a third or more
+RIM_PHOTOS = 2  # photos that show the ground behind a top in shadow, at least
 
 
 @dataclass(frozen=True)
@@ -44,11 +48,65 @@ def find_shadows(field: GroundField) -> GroundShadows:
     visibility = (np.exp(np.minimum(field.residual, 0.5)) - floor) / (1 - floor)
     likelihood = _likelihood(field, dark)
     if field.beyond is None:
-        return GroundShadows(visibility.astype(np.float32), dark, likelihood, _largest(likelihood, field))
-    seam = _seam(field.beyond)
-    mask = _largest(_across(likelihood, seam), field)
-    no_ground = np.where(field.beyond | seam, np.float32(ODDS), likelihood)
-    return GroundShadows(visibility.astype(np.float32), dark, no_ground, mask)
+        mask = _largest(likelihood, field)
+    else:
+        seam = _seam(field.beyond)
+        mask = _largest(_across(likelihood, seam), field)
+        likelihood = np.where(field.beyond | seam, np.float32(ODDS), likelihood)
+    tops = level_tops(likelihood, mask, (field.usable & (field.residual < DARK)).sum(0))
+    likelihood = np.where(tops, np.float32(ODDS), likelihood)
+    return GroundShadows(visibility.astype(np.float32), dark, likelihood, mask | tops)
+
+
+def level_tops(
+    likelihood: Float[np.ndarray, "height width"],
+    mask: Bool[np.ndarray, "height width"],
+    dark: Int[np.ndarray, "height width"],
+) -> Bool[np.ndarray, "height width"]:
+    """Return the object's level tops: they are lit as the ground is, but the object and its shadows enclose them.
+
+    A top is a hole in what is unlike the ground, or in that together with the shadows of all photos, and no wider than
+    the object. Shadows alone enclose ground, too, as those of a thick head on a thin neck that meet behind it, or what
+    is too dark to show them, as print. A top has the object's side below it, towards the camera: FRONT of its rim, or
+    more. Behind it the ground is hidden from many lights: half of the rest of the rim is dark in RIM_PHOTOS photos.
+
+    Args:
+        likelihood: mean log likelihood ratio, object over ground.
+        mask: the object without these tops.
+        dark: how many photos show a pixel in shadow.
+    """
+    found = np.zeros(mask.shape, bool)
+    if not mask.any():
+        return found
+    unlike, widest, holes = _closed(likelihood > GROUND_LIKE), _extent(mask), np.empty(mask.shape, np.int32)
+    seen = _joined(mask, unlike)
+    for whole in (seen, _joined(mask, _closed(unlike | (dark > 0)))):
+        label(np.asarray(binary_fill_holes(whole)) & ~whole, output=holes)
+        for number, box in enumerate(find_objects(holes), 1):
+            if max(side.stop - side.start for side in box) > widest:
+                continue
+            around = tuple(slice(max(side.start - len(RIM), 0), side.stop + len(RIM)) for side in box)
+            hole = (holes[around] == number).astype(np.uint8)
+            edge = cv2.dilate(hole, NEIGHBOURS) > 0
+            rim = (cv2.dilate(hole, RIM) > 0) & ~edge
+            behind = rim & ~unlike[around]
+            has_front = seen[around][rim].mean() > FRONT
+            if has_front and (not behind.any() or np.median(dark[around][behind]) >= RIM_PHOTOS):
+                found[around] |= edge
+    return found
+
+
+def _joined(
+    mask: Bool[np.ndarray, "height width"], region: Bool[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """Return the mask with all of the region that hangs together with it."""
+    parts = np.empty(mask.shape, np.int32)
+    label(region | mask, NEIGHBOURS, output=parts)
+    return np.isin(parts, parts[mask])
+
+
+def _closed(region: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    return cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_CLOSE, NEIGHBOURS) > 0
 
 
 def _seam(beyond: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
@@ -124,13 +182,19 @@ def _with_plinth(
         strip = parts == number
         if number == 0 or _extent(strip) < widest:
             continue
-        hull = np.zeros(chosen.shape, np.uint8)
-        cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(strip)[:, ::-1].astype(np.int32)), 1)
-        near, is_bent = cv2.dilate(hull, disc) > 0, hull.sum() > BENT * strip.sum()
-        if is_bent and chosen[hull > 0].any():
-            both = cv2.morphologyEx((found | (hull > 0)).astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
-            found |= (both & near) | (hull > 0)
+        hull = convex_hull(strip)
+        near, is_bent = cv2.dilate(hull.astype(np.uint8), disc) > 0, hull.sum() > BENT * strip.sum()
+        if is_bent and chosen[hull].any():
+            both = cv2.morphologyEx((found | hull).astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
+            found |= (both & near) | hull
     return np.asarray(binary_fill_holes(found))
+
+
+def convex_hull(region: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """Return the pixels inside the convex hull of a region that is not empty."""
+    hull = np.zeros(region.shape, np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(region)[:, ::-1].astype(np.int32)), 1)
+    return hull > 0
 
 
 def _extent(region: Bool[np.ndarray, "height width"]) -> int:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import label
 
 from calibration.ground.ground_field import GroundField
-from calibration.ground.ground_shadows import DARK, GROUND_LIKE, GroundShadows
+from calibration.ground.ground_shadows import DARK, GROUND_LIKE, GroundShadows, convex_hull
 from calibration.ground.shadow_reach import most_height
 from calibration.lights.ground_cells import ground_points
 from calibration.outlines.metric_cues import MetricCues, ProvenSpace, proven_space
@@ -49,10 +49,16 @@ class OutlineMaps:
         return len(self.dark)
 
 
-def outline_maps(field: GroundField, shadows: GroundShadows, posed_camera: PosedCamera) -> OutlineMaps | None:
+def outline_maps(
+    field: GroundField, shadows: GroundShadows, posed_camera: PosedCamera, is_hull_unknown: bool = False
+) -> OutlineMaps | None:
     """Return the maps of all photos; None where no object is in sight.
 
     Ground that the object hides, that is no ground, clipped or too dim is unknown: it may be lit or dark.
+
+    Args:
+        is_hull_unknown: what lies in the convex hull of the object's outline is unknown, too. What looks like ground
+            there may be a level top, lit as the ground is: taken for ground, it proves space empty that is full.
     """
     height, width = shadows.object_mask.shape
     camera = posed_camera.resized(width, height)
@@ -68,8 +74,9 @@ def outline_maps(field: GroundField, shadows: GroundShadows, posed_camera: Posed
     near = down & (np.linalg.norm(points - foot, axis=-1) < REACH * size)
     if not near.any():  # a strip at the horizon
         return None
+    unknown = convex_hull(mask) if is_hull_unknown else mask
     bare = near & (cv2.GaussianBlur(shadows.likelihood, (0, 0), 1.0) < GROUND_LIKE)
-    bare &= cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0
+    bare &= cv2.dilate(unknown.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0
     bright = np.quantile(field.light[:, near], 0.9, axis=1)
     black = field.residual < DARK  # too dark to be measured, as a sharpened shadow's rim is, and yet surely dark
     known = bare & (field.usable | black) & (field.light > (bright - DIM)[:, None, None])
@@ -78,7 +85,7 @@ def outline_maps(field: GroundField, shadows: GroundShadows, posed_camera: Posed
     sure = np.stack([look(one) > 0.99 for one in known])
     lit = np.stack([look(one) > LIT for one in shadows.visibility]) & sure
     dark = sure & ~lit
-    behind = look(mask) > 0.5
+    behind = look(unknown) > 0.5
     fields = np.stack([signed_distance(one) for one in (*lit, ~behind)]) * cell
     cast = [_from_object(one, behind) for one in dark]
     hidden = cv2.dilate(behind.astype(np.uint8), np.ones((2 * TOUCHING + 1, 2 * TOUCHING + 1), np.uint8)) > 0
