@@ -165,14 +165,16 @@ def test_directions_follow_their_shadows_too(monkeypatch):
     assert off(fit(given, RICH, silent).lights, scene.lights) < 0.7 * off(given.lights, scene.lights)
 
 
-@pytest.mark.slow  # 15 s: two solves; the trial alone is tested below
+@pytest.mark.slow  # 20 s: three solves; the trial alone is tested below
 def test_perfect_lights_that_were_called_uncertain_stay_where_they_are():
     scene, truth = heap()
     uncertain = replace(scene, light_sigma=misplaced(scene, 0.03).light_sigma)
-    fields, held = fit(uncertain, RICH, silent), fit(scene, RICH, silent)
+    fields = fit(uncertain, RICH, silent)
     assert fields.light_trial is not None and not fields.light_trial.is_accepted
     torch.testing.assert_close(fields.lights, scene.lights, rtol=0, atol=0)
-    assert depth_error(fields, scene, truth) < 1.3 * depth_error(held, scene, truth)  # seeds alone: 0.61 to 0.84 mm
+    # seeds alone make 0.60, 0.67 and 0.82 mm of it: one held solve is no measure
+    held = [depth_error(fit(scene, replace(RICH, seed=seed), silent), scene, truth) for seed in (0, 1)]
+    assert depth_error(fields, scene, truth) < 1.3 * np.mean(held)
 
 
 def true_surface(truth, spacing: float = 3.0) -> SdfGrid:
