@@ -20,11 +20,12 @@ from reconstruct.initialization.shadow_mask import with_object_mask
 from reconstruct.labels.held_out import HeldOuts, draw_blocks, hold_out
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
-from reconstruct.labels.supervision import Supervision, placed_rays, restricted, supervise
+from reconstruct.labels.supervision import Supervision, normal_rays, placed_rays, restricted, supervise
 from reconstruct.render.joined import join_views
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet, resampled
+from reconstruct.sdf.normal_fusion import combine_with_normals
 from reconstruct.sdf.rays import thread_count
 from reconstruct.solve.backend import surface_on
 from reconstruct.solve.checkpoint import CheckpointWriter, SolveState, load_state, save_state
@@ -86,9 +87,10 @@ def fit(
     """Fit the surface and albedo that explain the shadows and shading of a scene, or of several views of one object.
 
     1. Every pixel is tested against the known ground. 2. Lit ground carves the shadow hull. 3. On finer and finer
-    grids, labels are recomputed with the current surface, and the surface moves until its shadow rays agree. Lights
-    that the scene marks as uncertain move with it; each level computes its labels under the current lights. The lights
-    are tried at the end of the first levels, until they explain held-out rays better than the calibrated ones.
+    grids, labels are recomputed with the current surface, and the surface moves until its shadow rays agree. 4. Its
+    unevenness follows the normals of the last level's labels, see `combine_with_normals`. Lights that the scene marks
+    as uncertain move with it; each level computes its labels under the current lights. The lights are tried at the end
+    of the first levels, until they explain held-out rays better than the calibrated ones.
 
     Args:
         scene: what one camera sees, or what each of several does: one surface is solved from all.
@@ -174,7 +176,9 @@ def _solved(
             writer.keep(state)
     lit = lit_from(scenes, state.shift)
     assert rays is not None  # the loop ends after a level
-    return _Solved(observers, lit, rays, begin, begin.better(origin, state.start, lit), state)
+    normals = [normal_rays(scene, own) for scene, own in zip(placed(lit), rays, strict=True)]
+    surface = combine_with_normals(begin.better(origin, state.start, lit), normals)
+    return _Solved(observers, lit, rays, begin, surface, state)
 
 
 def _fields(
