@@ -4,7 +4,7 @@ Slow, for the draft is a real one. A picture of each step lies in the test's fol
 """
 
 import pytest
-from chromium import CHROMIUM, wait_until
+from chromium import CHROMIUM, PATIENCE_MS, wait_until
 from small_example import small_example
 from studio_client import served
 from test_studio import capture_in, program  # noqa: F401  a fixture
@@ -16,6 +16,14 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
 ]
 STATE = "window.shadowgraph ? window.shadowgraph.state() : null"
+
+
+def finished_stage(tab):
+    """The frame of a result once its own picture has come in place of the first one. Locators outlast a navigation."""
+    page = tab.frame_locator("iframe.result")
+    page.locator("#picture").wait_for(timeout=PATIENCE_MS)
+    page.locator("#first").wait_for(state="detached", timeout=PATIENCE_MS)
+    return tab.frames[-1]
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
@@ -54,9 +62,7 @@ def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp
         tab.wait_for_selector("section.queue")
         look("home-at-work")
         tab.click("section.queue a")
-        tab.wait_for_selector("iframe.result")
-        wait_until(tab, lambda: len(tab.frames) > 1 and tab.frames[-1].locator("#first").count() == 0)
-        stage = tab.frames[-1]
+        stage = finished_stage(tab)
         look("result")
         box = tab.locator("iframe.result").bounding_box()
         middle = (box["x"] + 0.35 * box["width"], box["y"] + box["height"] / 2)
@@ -132,10 +138,7 @@ def test_the_keyboard_alone_starts_a_run_and_lights_turns_and_edits_a_result(bro
         tab.wait_for_selector(".card")
         press_until(tab, "heap")
         tab.keyboard.press("Enter")
-        tab.wait_for_selector("iframe.result")
-        wait_until(tab, lambda: len(tab.frames) > 1 and tab.frames[-1].evaluate("Boolean(window.shadowgraph)"))
-        stage = tab.frames[-1]
-        wait_until(tab, lambda: stage.locator("#first").count() == 0)
+        stage = finished_stage(tab)
         tab.locator("h1").first.evaluate("(one) => { one.tabIndex = -1; one.focus(); }")
         press_until(tab, "to relight and turn")
         for _ in range(20):
