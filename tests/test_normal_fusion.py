@@ -3,10 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from scipy.ndimage import gaussian_filter
+from synthetic import BALL, Look, render
 from torch.nn.functional import normalize
 
+from reconstruct.labels.labels import assemble_labels
+from reconstruct.labels.outline import local_mean
+from reconstruct.labels.supervision import normal_rays, supervise
+from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.normal_fusion import NormalRays, combine_with_normals
 from reconstruct.sdf.rays import find_surface
@@ -109,3 +115,17 @@ def test_outlines_stay_where_pixels_see_them():
     at = (normalize(points, dim=1) * normalize(points - front.eye, dim=1)).sum(1).abs() < 0.35
     moved = [float(one.sdf(points[at]).abs().mean()) for one in (free, held)]
     assert moved[1] < 0.5 * moved[0]
+
+
+@pytest.mark.parametrize("is_colour", [True, False])
+def test_normals_are_taken_from_object_pixels_of_photos_and_not_of_shadow_pictures(is_colour):
+    scene, _ = render((BALL,), Look(with_shadow=True, with_mask=True))
+    scene = scene if is_colour else replace(scene, rgb=None)
+    labels = assemble_labels(replace(scene, rgb=None), None, None)
+    rays = supervise(scene, replace(labels, mask=local_mean(labels.mask[None], 3)[0]))  # grey at the outline
+    rays = replace(rays, normal_confidence=np.ones_like(rays.normal_confidence))
+    found = normal_rays(scene, rays)
+    object_pixels = rays.role == kernels.OBJECT
+    assert object_pixels.any() and (rays.role == kernels.EDGE).any()
+    np.testing.assert_array_equal(found.trust > 0, object_pixels & is_colour)
+    np.testing.assert_array_equal(found.at_outline, rays.role == kernels.EDGE)

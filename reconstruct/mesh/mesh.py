@@ -115,7 +115,7 @@ def _above_ground(grid: SdfGrid, ground_height: float) -> tuple[Float[np.ndarray
 
     A cut with max(sdf, ground - z) instead would bevel the rim of the base by up to a voxel.
     """
-    values = grid.values.numpy() / np.float32(grid.spacing)
+    values = grid.in_voxels()
     height = (float(grid.origin[2]) - ground_height) / grid.spacing + np.arange(values.shape[2])
     first = int(np.searchsorted(height, OFF_SURFACE, side="right"))
     layers, levels = values[:, :, first:], height[first:]

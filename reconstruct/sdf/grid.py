@@ -59,10 +59,18 @@ class SdfGrid:
         """Return the corner opposite to origin, world."""
         return self.origin + self.spacing * self._last()
 
+    def in_voxels(self) -> Float[np.ndarray, "nx ny nz"]:
+        """Return a copy of the values in voxels, float32."""
+        return np.ascontiguousarray((self.values / self.spacing).numpy(), np.float32)
+
+    def with_voxels(self, phi: Float[np.ndarray, "nx ny nz"]) -> "SdfGrid":
+        """Return the grid of the same box whose values in voxels, float32, are phi."""
+        return SdfGrid(torch.from_numpy(phi * np.float32(self.spacing)), self.origin, self.spacing)
+
     @cached_property
     def blocks(self) -> Blocks:
         """The SDF in voxels, in the format of the kernels of rays; made once, because a grid's values do not change."""
-        return overlapping(pack(np.ascontiguousarray((self.values / self.spacing).numpy(), dtype=np.float32)))
+        return overlapping(pack(self.in_voxels()))
 
     @cached_property
     def ball(self) -> Ball:

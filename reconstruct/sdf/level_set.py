@@ -113,6 +113,11 @@ def redistanced(field: Blocks) -> Blocks:
     return field._replace(pool=np.where(field.pool < 0, -out, out))
 
 
+def as_distance(phi: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "nx ny nz"]:
+    """Return the same of a dense array."""
+    return redistanced(pack(phi)).dense()
+
+
 def resampled(grid: SdfGrid, nodes: int) -> LevelSet:
     """Return a grid's surface as a level set with `nodes` nodes along the longest side of the same box."""
     lower, upper = grid.origin.double().numpy(), grid.upper().double().numpy()

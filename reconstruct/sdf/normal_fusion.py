@@ -9,6 +9,7 @@ one depth map move; here, the signed distances of a grid, because several camera
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,15 +18,14 @@ from scipy.sparse import csr_matrix, diags, vstack
 from scipy.sparse.linalg import cg
 from torch import Tensor
 
-from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.level_set import redistanced
+from reconstruct.sdf.level_set import as_distance
 from reconstruct.sdf.rays import first_hits
 
 BAND = 3.0  # voxels about the surface in which nodes move: differences are taken within 2.4 of it
 ON_SURFACE = 1.0  # voxels: nodes that are held to where they are
 HELD = 0.1  # weight of that, beside a sure normal's 1: positions decide beyond some 2 pi / HELD voxels
-AT_REST = 1.0  # the same where no normal is near: what no camera sees does not follow what is seen
+AT_REST = 1.0  # the same where no normal is near; a tenth of it moves a hidden side by .001 voxels more
 AT_OUTLINE = 1.0  # the same for the points of pixels at an outline, whose place is seen itself
 ALIKE = 0.1  # weight of the differences of neighbours' moves: what no normal tells moves with what is near
 OUTLIER = np.radians(10.0)  # angle to a normal beyond which it is rather wrong than the surface
@@ -46,8 +46,7 @@ class NormalRays:
     at_outline: Bool[np.ndarray, " n"]
 
 
-@dataclass(frozen=True)
-class _Seen:
+class _Seen(NamedTuple):
     """Points of the surface that pixels see."""
 
     points: Float[np.ndarray, "n 3"]  # voxels
@@ -62,13 +61,11 @@ def combine_with_normals(surface: SdfGrid, cameras: Sequence[NormalRays]) -> Sdf
         sum over pixels of trust rho |grad (phi + d) - n|^2  +  AT_OUTLINE^2 sum over pixels at outlines of d^2
         +  HELD^2 sum over nodes near the surface of d^2  +  ALIKE^2 sum over neighbours p, q of (d_p - d_q)^2,
 
-    with rho the weights of Geman and McClure. The gradient is that of `SdfGrid.gradient`, at the points of the surface
-    that the pixels see. To find these again on the moved surface and to move it once more gains nothing. Without
-    normals the surface stays as it is.
+    with rho the weights of Geman and McClure, and AT_REST for HELD where no normal is near. The gradient is that of
+    `SdfGrid.gradient`, at the points of the surface that the pixels see. To find these again on the moved surface and
+    to move it once more gains nothing. Without normals the surface stays as it is.
     """
-    parts = [_seen(surface, camera) for camera in cameras]
-    names = ("points", "normals", "trust", "at_outline")
-    seen = _Seen(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    seen = _Seen(*map(np.concatenate, zip(*(_seen(surface, camera) for camera in cameras), strict=True)))
     return _moved(surface, seen) if seen.trust.any() else surface
 
 
@@ -88,7 +85,7 @@ def _seen(surface: SdfGrid, camera: NormalRays) -> _Seen:
 
 def _moved(surface: SdfGrid, seen: _Seen) -> SdfGrid:
     """Return the surface of the least squares, redistanced."""
-    phi = surface.values.numpy() / np.float32(surface.spacing)
+    phi = surface.in_voxels()
     moving = np.abs(phi) < BAND
     number = np.full(phi.shape, -1, np.int32)  # of the unknown at each node
     number[moving] = np.arange(moving.sum(), dtype=np.int32)
@@ -109,9 +106,7 @@ def _moved(surface: SdfGrid, seen: _Seen) -> SdfGrid:
         scale = diags(1 / np.maximum(matrix.diagonal(), 1e-9))
         move, _ = cg(matrix, right, x0=move, rtol=ACCURATE, maxiter=MOST_STEPS, M=scale)
     phi[moving] += move.astype(np.float32)
-    return SdfGrid(
-        torch.from_numpy(redistanced(pack(phi)).dense() * np.float32(surface.spacing)), surface.origin, surface.spacing
-    )
+    return surface.with_voxels(as_distance(phi))
 
 
 def _differences(number: Int[np.ndarray, "nx ny nz"], points: Float[np.ndarray, "n 3"], axis: int) -> csr_matrix:

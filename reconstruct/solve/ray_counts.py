@@ -29,8 +29,7 @@ def ray_counts(
     This is the count c of the level set's step for a surface at rest: shadow rays well inside or outside a shadow do
     not add to it. It is scaled as if every label of the views together were one ray.
     """
-    phi = np.ascontiguousarray((grid.values / grid.spacing).numpy(), np.float32)
-    surface = LevelSet(phi, grid.origin.double().numpy(), grid.spacing, is_distance=True)
+    surface = LevelSet(grid.in_voxels(), grid.origin.double().numpy(), grid.spacing, is_distance=True)
     scenes, rays = each(scenes), each(rays)
     passes = joint_passes(surface, scenes, rays, config)
     first = sum(level.iterations for level in config.levels)

@@ -15,9 +15,8 @@ from torch import Tensor
 from reconstruct.labels.supervision import DARK_ENOUGH, SURE_ENOUGH, Supervision
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
-from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.level_set import redistanced
+from reconstruct.sdf.level_set import as_distance
 from reconstruct.sdf.rays import first_hits, lights_to_grid, to_grid, visibility
 from reconstruct.views import Scenes, each
 
@@ -63,9 +62,9 @@ def without_unsupported_matter(
     """
     scenes, rays = each(scenes), each(rays)
     walls = _walls(surface.values.shape)
-    phi = _in_voxels(surface)
+    phi = surface.in_voxels()
     phi[walls] = np.maximum(phi[walls], AIR)
-    phi = _as_distance(phi)
+    phi = as_distance(phi)
     before, low = phi.copy(), _first_above(surface, scenes[0].ground_height)
     seen = [_seen(surface, scene, own) for scene, own in zip(scenes, rays, strict=True)]
     shell = np.logical_or.reduce([near for _, near in seen])
@@ -77,23 +76,11 @@ def without_unsupported_matter(
         _tighten(phi, fixed, low)
         np.clip(phi, before, most, out=phi)
         if (step + 1) % CHECK_EVERY == 0:
-            phi = _as_distance(phi)
+            phi = as_distance(phi)
             if np.abs(phi - last)[np.abs(last) < 1].max(initial=0) < AT_REST:
                 break
             last = phi.copy()
-    return _as_grid(phi, surface)
-
-
-def _in_voxels(grid: SdfGrid) -> Voxels:
-    return np.ascontiguousarray((grid.values / grid.spacing).numpy(), np.float32)
-
-
-def _as_distance(phi: Voxels) -> Voxels:
-    return redistanced(pack(phi)).dense()
-
-
-def _as_grid(phi: Voxels, like: SdfGrid) -> SdfGrid:
-    return SdfGrid(torch.from_numpy(phi * np.float32(like.spacing)), like.origin, like.spacing)
+    return surface.with_voxels(phi)
 
 
 def _walls(shape: tuple[int, ...]) -> Nodes:
@@ -173,7 +160,7 @@ def _kept(phi: Voxels, like: SdfGrid, seen: Nodes, dark: list[tuple[Tensor, Tens
         low: the first layer of nodes above the ground.
     """
     starts, lights = (torch.cat(parts).contiguous() for parts in zip(*dark, strict=True))
-    alone = _as_grid((_away(seen) - EXPLAINED).astype(np.float32), like)
+    alone = like.with_voxels((_away(seen) - EXPLAINED).astype(np.float32))
     needy = visibility(alone, starts, lights, SHARPNESS / like.spacing) > DARK_ENOUGH
     needed = np.zeros(phi.shape, bool)
     needed[tuple(_deepest(phi, like, (starts[needy], lights[needy])).T)] = True
