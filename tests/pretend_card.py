@@ -5,7 +5,7 @@ modules and optimisers treat it as a card. What it shows is that nothing on the 
 two devices, draws with the wrong generator, or hands a card's tensor to numpy. What it cannot show: a card's own
 rounding, its memory, its speed.
 
-A process that has made the device keeps it: tests run `pretend_card_cases.py` in a process of its own.
+A process that has made the device keeps it: tests run `card_cases.py` in a process of its own.
 """
 
 from collections.abc import Callable, Iterator
