@@ -27,7 +27,8 @@ from calibration.calibration import Calibration, load_calibration
 from calibration.light import Light
 from calibration.pose import Pose
 from capture.photos.photo import decode_srgb, encode_srgb
-from reconstruct.detail.file import DETAIL, load_detail, with_detail
+from reconstruct.detail.file import DETAIL, load_details
+from reconstruct.detail.sample import with_detail
 from reconstruct.fields import load_fields
 from reconstruct.render.g_buffer import RenderView, look
 from reconstruct.render.relight import lit_share, relight
@@ -151,7 +152,7 @@ def main() -> None:
     )
     view = look(fields, posed_camera=replace(fields.posed_camera, camera=camera))
     if not arguments.without_detail:
-        view = with_detail(view, load_detail(arguments.run / DETAIL, fields), camera)
+        view = with_detail(view, load_details(arguments.run / DETAIL, fields), camera)
     rows = []
     for truth in truths:
         row, picture = score(truth, view, calibration, mask, arguments.samples)

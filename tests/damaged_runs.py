@@ -27,7 +27,7 @@ from calibration.calibration import Calibration, load_calibration, save_calibrat
 from calibration.pose import Pose
 from calibration.side_view import SideView
 from reconstruct.appearance.brdf import LOBES, Gloss
-from reconstruct.detail.file import DETAIL, Detail, save_detail
+from reconstruct.detail.file import DETAIL, Detail, save_details
 from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields, FurtherView, Verdict, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
@@ -58,7 +58,7 @@ def make(folder: Path, width: int = 64, n_lights: int = 6) -> Path:
     save_fields(fields, run / "fields.safetensors")
     save_mesh(extract_mesh(fields), run / "mesh.ply", run / "mesh.glb", "mm")
     (run / "hull.ply").write_bytes((run / "preview.ply").read_bytes())
-    save_detail(_detail(fields), fields, run / DETAIL)
+    save_details([_detail(fields)], fields, run / DETAIL)
     cost = {"seconds": 4.0, "cpu_seconds": 7.1, "peak_memory_bytes": 412_000_000}
     manifest = {"format": 1, "inputs": {"photos/IMG_1.jpg": "0" * 64}, "config": {"preset": "draft", "seed": 0}}
     _write(run / "manifest.json", manifest | {"costs": {"solve": cost}, "finished": ["solve"], "made_with": {}})
@@ -104,7 +104,7 @@ def make_several(folder: Path) -> Path:
     )
     fields = replace(fields, view="view_1", further=further, gloss=None, light_share=0.01)
     save_fields(fields, run / "fields.safetensors")
-    save_detail(_detail(fields), fields, run / DETAIL)
+    save_details([_detail(fields), replace(_detail(fields), view=2)], fields, run / DETAIL)
     for name in ("view_2", "turned_1"):
         (run / name).mkdir()
         for file in ("depth.npy", "normal.npy", "mask.png"):

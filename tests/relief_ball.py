@@ -35,14 +35,15 @@ class Relief:
     mask: Bool[np.ndarray, "height width"]
 
 
-def make(folder: Path, width: int = 440, n_lights: int = 14) -> Relief:
-    """16-bit PNG photos in a folder."""
+def make(folder: Path, width: int = 440, n_lights: int = 14, turn: Float[np.ndarray, "3 3"] | None = None) -> Relief:
+    """16-bit PNG photos in a folder, of the ball turned about its middle's vertical axis."""
+    turn = np.eye(3) if turn is None else turn
     look = Look(width=width, height=width * 3 // 4, n_lights=n_lights, ambient=0.0)
     truth = render((BALL,), look)[1]
     mask, points = truth.mask, truth.points
     smooth = truth.normals
-    normals = np.where(mask[..., None], bent(points, smooth), smooth)
-    odd = np.floor(points / CELL).astype(int).sum(-1) % 2 == 1
+    normals = np.where(mask[..., None], bent(points @ turn, smooth @ turn) @ turn.T, smooth)
+    odd = np.floor(points @ turn / CELL).astype(int).sum(-1) % 2 == 1
     albedo = np.where(mask[..., None], np.where(odd[..., None], DARK, LIGHT), truth.albedo)
     folder.mkdir(parents=True, exist_ok=True)
     paths = []

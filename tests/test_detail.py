@@ -8,18 +8,23 @@ import relief_ball
 import torch
 
 import capture.photos.photo
+from calibration.calibrated_views import CalibratedView, CalibratedViews
 from calibration.known_scene import KnownScene
+from calibration.pose import Pose
 from capture.errors import CaptureError, ReconstructionError
 from capture.photos.photo import decode_srgb, read_photo, read_stack
+from capture.session.capture import Capture
 from reconstruct.appearance.brdf import LOBES
 from reconstruct.appearance.lobe_fit import Samples
 from reconstruct.detail import full_photos as detail_photos
 from reconstruct.detail.detail import estimate_illumination, solve_detail
-from reconstruct.detail.file import DETAIL, SURE, UNIT, detail_at, load_detail, save_detail, with_detail
+from reconstruct.detail.file import DETAIL, SURE, UNIT, load_details, save_details
 from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail, specular_part
 from reconstruct.detail.full_photos import FullPhotos, PixelFile, colours_of, full_photos
 from reconstruct.detail.merge import merged
+from reconstruct.detail.sample import detail_at, with_detail
 from reconstruct.detail.surface import Window, see_surface
+from reconstruct.fields import FurtherView
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.mesh.simplify import simplified
 from reconstruct.mesh.texture import bake, size_for
@@ -97,7 +102,7 @@ def test_places_are_read_where_the_camera_sees_them_and_nowhere_else(ball, detai
     places = torch.from_numpy(
         np.stack([centre + radius * d / np.linalg.norm(d) for d in (towards_camera, away)])
     ).float()
-    at = detail_at(detail, ball.fields.grid, places)
+    at = detail_at([detail], ball.fields.grid, places)
     assert at.confidence[0] > 0.9 and at.confidence[1] == 0
     true = relief_ball.bent(places[:1].double().numpy(), towards_camera[None] / np.linalg.norm(towards_camera))
     assert relief_ball.angles(at.normals[:1].double().numpy(), true)[0] < 6
@@ -106,13 +111,13 @@ def test_places_are_read_where_the_camera_sees_them_and_nowhere_else(ball, detai
 def test_a_view_shows_the_detail_where_it_is_sure(ball, detail):
     camera = ball.calibration.camera
     plain = look(ball.fields, posed_camera=replace(ball.fields.posed_camera, camera=camera))
-    fine = with_detail(plain, detail, camera)
+    fine = with_detail(plain, [detail], camera)
     sure = np.zeros(ball.mask.shape, bool)
     inside(detail, sure)[:] = detail.confidence > 0.9 * SURE
     before = relief_ball.angles(plain.maps.normals.double().numpy()[sure], ball.normals[sure])
     after = relief_ball.angles(fine.maps.normals.double().numpy()[sure], ball.normals[sure])
     assert np.median(after) < 0.5 * np.median(before)
-    assert with_detail(plain, None, camera) is plain
+    assert with_detail(plain, [], camera) is plain
 
 
 def test_a_smaller_view_takes_the_mean_of_the_pixels_that_it_covers(detail):
@@ -128,11 +133,11 @@ def test_a_smaller_view_takes_the_mean_of_the_pixels_that_it_covers(detail):
 def test_the_baked_pictures_hold_relief_and_colour(ball, detail):
     full = extract_mesh(ball.fields)
     small, size = simplified(full, 2000), 512
-    with_it, without = bake(ball.fields, small, full, size, detail), bake(ball.fields, small, full, size)
-    assert size_for(detail, full) > 256
+    with_it, without = bake(ball.fields, small, full, size, [detail]), bake(ball.fields, small, full, size)
+    assert size_for([detail], full) > 256
     texel = [np.clip((b.uv[b.faces].mean(1) * size).astype(int), 0, size - 1).T for b in (with_it, without)]
     places = with_it.vertices[with_it.faces].mean(1)
-    sure = detail_at(detail, ball.fields.grid, torch.from_numpy(places).float()).confidence.numpy() > 0.95
+    sure = detail_at([detail], ball.fields.grid, torch.from_numpy(places).float()).confidence.numpy() > 0.95
     odd = np.floor(places / relief_ball.CELL).astype(int).sum(-1) % 2 == 1
     base, plain = (decode_srgb(b.base[t[1], t[0]])[:, 0] for b, t in zip((with_it, without), texel, strict=True))
     assert sure.sum() > 100
@@ -140,29 +145,29 @@ def test_the_baked_pictures_hold_relief_and_colour(ball, detail):
     assert np.ptp(plain[sure]) < 0.1
     tilt, flat = (b.normal_map[t[1], t[0], 2] / 127.5 - 1 for b, t in zip((with_it, without), texel, strict=True))
     assert tilt[sure].std() > 2 * flat[sure].std()
-    hidden = detail_at(detail, ball.fields.grid, torch.from_numpy(places).float()).confidence.numpy() == 0
+    hidden = detail_at([detail], ball.fields.grid, torch.from_numpy(places).float()).confidence.numpy() == 0
     assert np.median(np.abs(tilt - flat)[hidden]) < 0.01
 
 
 def test_a_detail_comes_back_from_its_file_and_only_with_its_surface(ball, detail, tmp_path):
     path = tmp_path / DETAIL
-    assert load_detail(path, ball.fields) is None
-    save_detail(detail, ball.fields, path)
-    back = load_detail(path, ball.fields)
-    assert back is not None and back.window == detail.window and back.posed_camera == detail.posed_camera
+    assert load_details(path, ball.fields) == ()
+    save_details([detail], ball.fields, path)
+    (back,) = load_details(path, ball.fields)
+    assert back.window == detail.window and back.posed_camera == detail.posed_camera
     for name in ("normals", "albedo", "confidence"):
         assert np.array_equal(getattr(back, name), getattr(detail, name))
-    assert load_detail(path, relief_ball.without_texture(ball.fields)) is None
+    assert load_details(path, relief_ball.without_texture(ball.fields)) == ()
 
 
 def test_a_damaged_detail_is_refused_by_name(ball, detail, tmp_path):
     path = tmp_path / DETAIL
-    save_detail(detail, ball.fields, path)
+    save_details([detail], ball.fields, path)
     data = bytearray(path.read_bytes())
     data[-1000] ^= 255
     path.write_bytes(data)
     with pytest.raises(ReconstructionError, match=r"detail\.safetensors: not a readable detail"):
-        load_detail(path, ball.fields)
+        load_details(path, ball.fields)
 
 
 # --- the stage -------------------------------------------------------------------------------------------------------
@@ -176,12 +181,12 @@ def test_the_stage_leaves_a_detail_and_is_done_once(ball, tmp_path):
         photos = read_photos(source, options)
 
         def write() -> None:
-            write_detail(source, options, run, photos, ball.calibration, ball.fields)
+            write_detail(source, options, run, (photos,), CalibratedViews.of(ball.calibration), ball.fields)
 
         assert done_once(run, "detail", "reading", write)
         assert not done_once(run, "detail", "reading", write)
         assert run.costs["detail"].cpu_seconds > 0
-        assert load_detail(run.file(DETAIL), ball.fields) is not None
+        assert len(load_details(run.file(DETAIL), ball.fields)) == 1
         assert "of memory and" in run.file("log.jsonl").read_text()
 
 
@@ -200,7 +205,7 @@ def test_reduced_photos_that_the_run_keeps_are_not_decoded_again(ball, tmp_path,
         monkeypatch.setattr(capture.photos.photo, "_read_reduced", None)
         again = read_photos(source, options, run.file(KEPT))
         monkeypatch.setattr(detail_photos, "read_photo", counted)
-        write_detail(source, options, run, again, ball.calibration, ball.fields)
+        write_detail(source, options, run, (again,), CalibratedViews.of(ball.calibration), ball.fields)
         assert whole == list(ball.paths) and run.file(DETAIL).exists()
 
 
@@ -306,3 +311,111 @@ def test_coarse_shape_is_the_surface_s_and_fine_relief_the_photos_(ball):
     )
     kept = merged(seen, relief, torch.zeros(len(relief)), 2.0)
     assert torch.allclose(kept, seen.normals, atol=1e-5)
+
+
+# --- several views ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def turned(ball, tmp_path_factory):
+    """The ball laid anew, a third of a turn about the vertical: the same camera sees another side of it."""
+    angle = np.radians(120)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+    return relief_ball.make(tmp_path_factory.mktemp("turned"), turn=turn), Pose(turn.T, np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def both(ball, detail, turned, tmp_path_factory):
+    """The fields of both lies, whose common albedo is brighter than the photos' own, and the detail of each."""
+    other, motion = turned
+    further = FurtherView("turned_1", 1.3 * ball.fields.albedo, ball.fields.camera, ball.fields.world_from_camera)
+    fields = replace(ball.fields, view="view_1", further=(replace(further, object_from_world=motion),))
+    stack = read_stack(other.paths, 160)
+    scene = build_scene(stack, other.calibration, 160)
+    files, seen = full_photos(stack, scene.photo_names), fields.views()[1]
+    folder, camera = tmp_path_factory.mktemp("both"), other.calibration.camera
+    found = solve_detail(estimate_illumination(scene, seen), seen, camera, files, folder, said_nothing)
+    assert found is not None
+    return fields, (detail, replace(found, view=1, object_from_world=motion))
+
+
+def on_ball(azimuth_degrees, count=200):
+    """Points of the ball around an azimuth, 20 to 50 degrees above its middle, and its normals there."""
+    rng = np.random.default_rng(1)
+    around = np.radians(azimuth_degrees + rng.uniform(-15, 15, count))
+    up = np.radians(rng.uniform(20, 50, count))
+    outward = np.stack([np.cos(around) * np.cos(up), np.sin(around) * np.cos(up), np.sin(up)], 1)
+    return np.array([0.0, 0, 40]) + 40.0 * outward, outward
+
+
+def test_a_place_gets_the_detail_of_the_view_that_sees_it_in_the_frame_of_all(both, detail):
+    fields, details = both
+    eye = detail.posed_camera.centre
+    front = np.degrees(np.arctan2(eye[1], eye[0]))
+    for azimuth, by_first in ((front, True), (front - 120, False)):  # where the camera stood, in the object's frame
+        places, outward = on_ball(azimuth)
+        points = torch.from_numpy(places).float()
+        at = detail_at(details, fields.grid, points)
+        alone = detail_at(details[:1], fields.grid, points)
+        assert (at.confidence > 0.9).float().mean() > 0.9 and bool((alone.confidence > 0.9).any()) == by_first
+        true = relief_ball.bent(places, outward)
+        assert np.median(relief_ball.angles(at.normals.double().numpy(), true)) < 2.5
+        assert np.median(relief_ball.angles(outward, true)) > 4
+
+
+def test_where_two_views_see_a_place_their_mean_is_no_worse_and_has_no_seam(both, detail):
+    fields, details = both
+    eye = detail.posed_camera.centre
+    places, outward = on_ball(np.degrees(np.arctan2(eye[1], eye[0])) - 60)
+    points = torch.from_numpy(places).float()
+    each = [detail_at([one], fields.grid, points) for one in details]
+    shared = ((each[0].confidence > 0.5) & (each[1].confidence > 0.5)).numpy()
+    assert shared.sum() > 50
+    true = relief_ball.bent(places, outward)[shared]
+    off = [
+        np.median(relief_ball.angles(one.normals.double().numpy()[shared], true))
+        for one in (*each, detail_at(details, fields.grid, points))
+    ]
+    assert off[2] < 1.05 * min(off)
+
+
+def test_the_albedo_of_one_of_several_views_is_in_the_scale_that_they_have_in_common(both):
+    _, (first, second) = both
+    sure = [one.confidence > 0.9 * SURE for one in (first, second)]
+    means = [one.albedo[where].astype(float).mean(0) for one, where in zip((first, second), sure, strict=True)]
+    assert means[1] / means[0] == pytest.approx(1.3, rel=0.04)
+
+
+def test_the_details_of_all_views_come_back_from_one_file(both, tmp_path):
+    fields, details = both
+    path = tmp_path / DETAIL
+    save_details(details, fields, path)
+    back = load_details(path, fields)
+    assert [one.view for one in back] == [0, 1] and back[0].object_from_world is None
+    assert np.array_equal(back[1].normals, details[1].normals) and back[1].object_from_world is not None
+    save_details(details[1:], fields, path)  # the first view sees nothing of the surface
+    assert [one.view for one in load_details(path, fields)] == [1]
+    with pytest.raises(ReconstructionError, match="a detail of view 2 was found, the surface has 1"):
+        load_details(path, replace(fields, further=()))
+
+
+def test_the_stage_reads_every_view_and_says_which(both, ball, turned, tmp_path, monkeypatch):
+    fields, _ = both
+    calibrated = CalibratedViews(
+        (CalibratedView("view_1", ball.calibration),),
+        lies=(CalibratedViews((CalibratedView("turned_1", turned[0].calibration),), name="turned_1"),),
+    )
+    sources = [
+        Source(tmp_path, Capture(tmp_path, (), name=name), KnownScene(one.calibration, one.paths, None, None))
+        for name, one in (("view_1", ball), ("turned_1", turned[0]))
+    ]
+    options = RunOptions(detail="on")
+    photos = tuple(read_photos(replace(one, capture=None), options) for one in sources)
+    monkeypatch.setattr(Source, "views", lambda _: tuple(sources))
+    monkeypatch.setattr(Source, "session", None)
+    with RunFolder(tmp_path / "run") as run:
+        run.claim({}, {})
+        write_detail(sources[0], options, run, photos, calibrated, fields)
+        assert [one.view for one in load_details(run.file(DETAIL), fields)] == [0, 1]
+        log = run.file("log.jsonl").read_text()
+    assert "view_1: " in log and "turned_1: " in log

@@ -20,7 +20,8 @@ from waiting import PATIENCE_S, wait_until
 from calibration.light import irradiance
 from capture.errors import ReconstructionError
 from capture.photos.photo import encode_srgb
-from reconstruct.detail.file import SURE, UNIT, Detail, save_detail, with_detail
+from reconstruct.detail.file import SURE, UNIT, Detail, save_details
+from reconstruct.detail.sample import with_detail
 from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields, load_fields
 from reconstruct.render.environment import sky_lights
@@ -443,8 +444,8 @@ def detail_of(fields: Fields) -> Detail:
 def test_the_computed_picture_shows_the_full_detail_as_relight_does(truth):
     fields = fake_run.fields_of(truth)
     detail, place = detail_of(fields), Viewpoint(fields.camera, fields.world_from_camera)
-    *_, found = ViewCache(fields, seen_material(fields), detail).steps(place, 160)
-    expected = with_detail(look(fields, 160), detail, fields.camera.resized(160, 120))
+    *_, found = ViewCache(fields, seen_material(fields), [detail]).steps(place, 160)
+    expected = with_detail(look(fields, 160), [detail], fields.camera.resized(160, 120))
     assert found is not None
     torch.testing.assert_close(found.maps.normals, expected.maps.normals)
     torch.testing.assert_close(found.albedo, expected.albedo)
@@ -456,7 +457,7 @@ def test_a_finished_run_is_shown_with_its_detail_or_without_a_damaged_one(tmp_pa
     fake_run.start_run(tmp_path, truth)
     fake_run.finish_run(tmp_path, truth)
     fields = load_fields(tmp_path / "fields.safetensors")
-    save_detail(detail_of(fields), fields, tmp_path / "detail.safetensors")
+    save_details([detail_of(fields)], fields, tmp_path / "detail.safetensors")
     page = Page(tmp_path, server)
     page.refresh()
 

@@ -122,7 +122,7 @@ class _Blocks:
     def __iter__(self) -> Iterator[tuple[slice, Samples, Float[Tensor, "n 3"], PixelGloss | None]]:
         """Yield each block's pixels, samples, albedo of the surface, and gloss."""
         for part in _blocks(self.seen):
-            yield part, self._samples(part), *self._material(part)
+            yield part, self._samples(part), *self.material(part)
 
     def _samples(self, part: slice) -> Samples:
         scene, points, normals = self.illumination.scene, self.seen.points[part], self.seen.normals[part]
@@ -140,7 +140,7 @@ class _Blocks:
             normals=normals,
         )
 
-    def _material(self, part: slice) -> tuple[Float[Tensor, "n 3"], PixelGloss | None]:
+    def material(self, part: slice) -> tuple[Float[Tensor, "n 3"], PixelGloss | None]:
         """Return albedo and gloss of the working-resolution pixel that contains each pixel."""
         row, column = _in_working_picture(self.seen, self.seen.index[part], self.camera, self.fields.camera)
         gloss = self.fields.gloss
@@ -175,14 +175,28 @@ def _solved(blocks: _Blocks, on_progress: Callable[[int, str], None]) -> Detail:
         on_progress(done, f"normals of {min(done * PIXELS_AT_ONCE, len(trust)) / 1e6:.2f} million pixels")
     trust *= torch.from_numpy(seen.inner)
     normals = merged(seen, normals, trust, blocks.fields.grid.spacing)
-    colour, confidence = torch.empty_like(normals), torch.from_numpy(seen.inner).clone()
-    for done, (part, samples, albedo, pixel_gloss) in enumerate(blocks, 1):
-        own, photos = fit_albedo(samples, normals[part], pixel_gloss)
-        share = (photos / ENOUGH_PHOTOS).clamp(0, 1)
-        colour[part] = torch.lerp(albedo, own, share[:, None])
-        confidence[part] *= share
+    colour, share = torch.empty_like(normals), torch.empty(len(seen.index))
+    for done, (part, samples, _, pixel_gloss) in enumerate(blocks, 1):
+        colour[part], photos = fit_albedo(samples, normals[part], pixel_gloss)
+        share[part] = (photos / ENOUGH_PHOTOS).clamp(0, 1)
         on_progress(total + done, f"albedo of {min(done * PIXELS_AT_ONCE, len(trust)) / 1e6:.2f} million pixels")
+    confidence = torch.from_numpy(seen.inner) * share
+    gain = _gain(blocks, colour, confidence) if blocks.fields.view else torch.ones(CHANNELS)
+    for part in _blocks(seen):
+        colour[part] = torch.lerp(blocks.material(part)[0], gain * colour[part], share[part, None])
     return _detail(blocks, normals, colour, confidence)
+
+
+def _gain(blocks: _Blocks, colour: Float[Tensor, "n 3"], confidence: Float[Tensor, " n"]) -> Float[Tensor, "3"]:
+    """Return the factor from one view's own albedo to the scale that the albedo of several views has in common.
+
+    See reconstruct/render/joined.py: exposure and white balance of its photos. The mean albedo stays the surface's.
+    """
+    own, common = torch.zeros(CHANNELS), torch.zeros(CHANNELS)
+    for part in _blocks(blocks.seen):
+        own += confidence[part] @ colour[part]
+        common += confidence[part] @ blocks.material(part)[0]
+    return torch.where((own > 0) & (common > 0), common / own, 1.0)
 
 
 def _detail(

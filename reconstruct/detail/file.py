@@ -1,8 +1,8 @@
-"""Detail: normals and albedo of a solved surface at the photos' resolution; its file, and sampling it at points."""
+"""Detail: normals and albedo of a solved surface at the photos' resolution, of each view; and their file."""
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -11,21 +11,17 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float16, Int16, UInt8
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from calibration.calibration import camera_of, is_rigid
-from calibration.camera import Camera
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError, ReconstructionError
 from capture.files.atomic import atomic_file
 from capture.files.json_field import JsonField
 from capture.files.regular import why
+from capture.session.capture import MOST_VIEWS
 from reconstruct.detail.surface import Window
 from reconstruct.fields import BRIGHTEST, MOST_NUMBERS, Fields
-from reconstruct.render.g_buffer import RenderView
-from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import in_line_of_sight
 from reconstruct.solve.checkpoint_file import CHECKSUM, FORMAT, checksum, read_whole
 from reconstruct.tensor_file import Layout, parsed, refuse_outside, write_tensors
 
@@ -34,27 +30,36 @@ DETAIL = "detail.safetensors"
 SURFACE = "surface"  # key of the header: id of the surface
 UNIT = 32767  # of a stored normal's component
 SURE = 255  # stored confidence 1
-SAME_VOXELS = 1.0  # a point this close to the camera's first hit counts as seen
-POINTS_AT_ONCE = 2**18
 MAKE = "remove it and run again."
 LARGEST_SIDE = 2**20  # px, of a photo
+OF_A_VIEW = {
+    "normals": Layout("I16", (None, None, 3), is_needed=False),
+    "albedo": Layout("F16", (None, None, 3), is_needed=False),
+    "confidence": Layout("U8", (None, None), is_needed=False),
+    "world_from_camera": Layout("F64", (4, 4), is_needed=False),
+}
 LAYOUTS = {
-    "normals": Layout("I16", (None, None, 3)),
-    "albedo": Layout("F16", (None, None, 3)),
-    "confidence": Layout("U8", (None, None)),
-    "world_from_camera": Layout("F64", (4, 4)),
+    f"{name}{number}": layout
+    for number in ("", *(f"_{view}" for view in range(1, MOST_VIEWS)))  # as in fields.safetensors: albedo_1
+    for name, layout in OF_A_VIEW.items()
 }
 
 
 @dataclass(frozen=True)
 class Detail:
-    """Normals, albedo and confidence of the object's pixels in a window of the photos. World frame."""
+    """Normals, albedo and confidence of the object's pixels in a window of one view's photos. The view's world."""
 
     normals: Int16[np.ndarray, "height width 3"]  # unit normal times UNIT; 0 where no object is seen
     albedo: Float16[np.ndarray, "height width 3"]  # linear, as Fields.albedo
     confidence: UInt8[np.ndarray, "height width"]  # SURE: well seen; 0: nothing better than the surface is known
     posed_camera: PosedCamera  # of the window
     window: Window  # in the photos
+    view: int = 0  # of Fields.views()
+    object_from_world: Pose | None = None  # of a view of another lie, see Fields.views; None: the world of the others
+
+    def in_world(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return points of the frame that all views share in the world of this one."""
+        return points if self.object_from_world is None else self.object_from_world.inverse().apply(points)
 
     def reduced(self, shrink: float) -> "Detail":
         """Average over blocks of `shrink` pixels per side, weighted by confidence; unchanged for less than 1.5."""
@@ -78,119 +83,80 @@ class Detail:
         )
 
 
-@dataclass(frozen=True)
-class DetailSample:
-    """A detail sampled at points of the surface."""
-
-    normals: Float[Tensor, "n 3"]  # unit, world; 0 where there is none
-    albedo: Float[Tensor, "n 3"]
-    confidence: Float[Tensor, " n"]  # in [0, 1]; 0 where the capture's camera does not see the place
-
-
-def detail_at(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> DetailSample:
-    """Interpolate the detail at world points on the surface."""
-    parts = [_some(detail, grid, part) for part in points.split(POINTS_AT_ONCE)]
-    if not parts:
-        return DetailSample(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
-    return DetailSample(*(torch.cat([getattr(p, name) for p in parts]) for name in ("normals", "albedo", "confidence")))
-
-
-def _some(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> DetailSample:
-    eye = torch.from_numpy(detail.posed_camera.centre).float()
-    pixels, depth = detail.posed_camera.project_with_depth(points.double().numpy())
-    u, v = pixels.T
-    height, width = detail.confidence.shape
-    inside = (depth > 0) & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    is_seen = torch.from_numpy(inside) & in_line_of_sight(grid, eye, points, SAME_VOXELS * grid.spacing)
-    out = DetailSample(torch.zeros_like(points), torch.zeros_like(points), torch.zeros(len(points)))
-    places = np.flatnonzero(is_seen.numpy())
-    columns, rows = np.minimum(u[places].astype(int), width - 2), np.minimum(v[places].astype(int), height - 2)
-    right, down = u[places] - columns, v[places] - rows
-    total = np.zeros((len(places), 7))
-    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        share = (down if i else 1 - down) * (right if j else 1 - right)
-        at = rows + i, columns + j
-        sure = share * detail.confidence[at] / SURE
-        total[:, :3] += sure[:, None] * detail.normals[at]
-        total[:, 3:6] += sure[:, None] * detail.albedo[at]
-        total[:, 6] += sure
-    found = torch.from_numpy(total).float()
-    out.normals[places] = normalize(found[:, :3], dim=-1)
-    out.albedo[places] = found[:, 3:6] / found[:, 6:].clamp(min=1e-6)
-    out.confidence[places] = found[:, 6]
-    return out
-
-
-def with_detail(view: RenderView, detail: Detail | None, camera: Camera) -> RenderView:
-    """Return the view with finer normals and albedo where the capture camera saw the surface.
-
-    Args:
-        detail: None: the view is returned unchanged.
-        camera: of the view, at about the capture camera's distance.
-    """
-    if detail is None:
-        return view
-    detail = detail.reduced(detail.posed_camera.camera.fx / camera.fx)
-    at = detail_at(detail, view.grid, view.maps.points[view.maps.mask])
-    share = at.confidence[:, None]
-    normals, albedo = view.maps.normals.clone(), view.albedo.clone()
-    normals[view.maps.mask] = normalize(torch.lerp(normals[view.maps.mask], at.normals, share), dim=-1)
-    albedo[view.maps.mask] = torch.lerp(albedo[view.maps.mask], at.albedo, share)
-    return replace(view, maps=replace(view.maps, normals=normals), albedo=albedo)
-
-
 def surface_id(fields: Fields) -> str:
     """Return an identifier of a surface."""
     return hashlib.sha256(fields.grid.values.contiguous().numpy().tobytes()).hexdigest()
 
 
-def save_detail(detail: Detail, fields: Fields, path: Path) -> None:
-    """Write a detail as safetensors with a checksum, whole or not at all.
+def save_details(details: Sequence[Detail], fields: Fields, path: Path) -> None:
+    """Write the details of a surface as safetensors with a checksum, whole or not at all.
 
     Args:
-        fields: the solved scene that it belongs to.
+        details: of different views, at least one.
+        fields: the solved scene that they belong to.
     """
-    tensors = {
-        "normals": torch.from_numpy(detail.normals),
-        "albedo": torch.from_numpy(detail.albedo),
-        "confidence": torch.from_numpy(detail.confidence),
-        "world_from_camera": torch.from_numpy(detail.posed_camera.world_from_camera.matrix()),
-    }
-    rest = {"camera": asdict(detail.posed_camera.camera), "window": asdict(detail.window)}
-    header = {FORMAT: VERSION, SURFACE: surface_id(fields), "detail": json.dumps(rest)}
+    tensors, header = {}, {FORMAT: VERSION, SURFACE: surface_id(fields)}
+    for detail in details:
+        number = _number(detail.view)
+        tensors |= {
+            f"normals{number}": torch.from_numpy(detail.normals),
+            f"albedo{number}": torch.from_numpy(detail.albedo),
+            f"confidence{number}": torch.from_numpy(detail.confidence),
+            f"world_from_camera{number}": torch.from_numpy(detail.posed_camera.world_from_camera.matrix()),
+        }
+        rest = {"camera": asdict(detail.posed_camera.camera), "window": asdict(detail.window)}
+        header[f"detail{number}"] = json.dumps(rest)
     with atomic_file(path) as temporary:
         write_tensors(tensors, {**header, CHECKSUM: checksum(tensors, header)}, temporary)
 
 
-def load_detail(path: Path, fields: Fields) -> Detail | None:
-    """Read the detail of a surface from a file, which may be a stranger's; None if there is none for this surface.
+def _number(view: int) -> str:
+    """Return what the names of a view's tensors end in."""
+    return f"_{view}" if view else ""
+
+
+def load_details(path: Path, fields: Fields) -> tuple[Detail, ...]:
+    """Read the details of a surface from a file, which may be a stranger's; none if there are none for this surface.
 
     Raises:
         ReconstructionError: the file is damaged, of another format, or holds what no run writes.
     """
     if not path.exists() and not path.is_symlink():
-        return None
+        return ()
     try:
         stored = read_whole(path, LAYOUTS, MOST_NUMBERS)
         if stored.header.get(FORMAT) != VERSION:
             raise ValueError(f"format {stored.header.get(FORMAT)!r} found, {VERSION!r} needed")
         if stored.header.get(SURFACE) != surface_id(fields):
-            return None
-        return _checked(
-            stored.tensors, JsonField(parsed(stored.header, "detail"), str(path), "the header", MAKE), fields
-        )
+            return ()
+        found = []
+        for view in range(MOST_VIEWS):
+            own = {name: stored.tensors.get(name + _number(view)) for name in OF_A_VIEW}
+            tensors = {name: tensor for name, tensor in own.items() if tensor is not None}
+            if tensors:
+                rest = JsonField(parsed(stored.header, f"detail{_number(view)}"), str(path), "the header", MAKE)
+                found.append(_checked(tensors, rest, fields, view))
     except CalibrationError as error:
         raise ReconstructionError(str(error)) from error
     except (OSError, ValueError) as error:
         raise ReconstructionError(f"{path}: not a readable detail ({why(error)}); {MAKE}") from error
+    if not found:
+        raise ReconstructionError(f"{path}: not a readable detail (it holds none, one was needed); {MAKE}")
+    return tuple(found)
 
 
-def _checked(tensors: Mapping[str, Tensor], rest: JsonField, fields: Fields) -> Detail:
-    """Return the detail in a file.
+def _checked(tensors: Mapping[str, Tensor], rest: JsonField, fields: Fields, view: int) -> Detail:
+    """Return one view's detail in a file.
 
     Raises:
         ValueError, CalibrationError: it is none that a run writes.
     """
+    seen = (fields, *fields.further)
+    if view >= len(seen):
+        raise ValueError(f"a detail of view {view + 1} was found, the surface has {len(seen)}")
+    missing = OF_A_VIEW.keys() - tensors.keys()
+    if missing:
+        raise ValueError(f"view {view + 1} lacks {', '.join(sorted(missing))}")
     camera = camera_of(rest["camera"], rest["camera"].get("fisheye", False).flag())
     place = rest["window"]
     window = Window(
@@ -212,4 +178,5 @@ def _checked(tensors: Mapping[str, Tensor], rest: JsonField, fields: Fields) -> 
     if not pose.translation[2] > fields.ground_height:
         raise ValueError("its camera is below the ground")
     normals, albedo, confidence = (tensors[name].numpy() for name in ("normals", "albedo", "confidence"))
-    return Detail(normals, albedo, confidence, PosedCamera(camera, pose, fields.ground_height), window)
+    posed = PosedCamera(camera, pose, fields.ground_height)
+    return Detail(normals, albedo, confidence, posed, window, view, seen[view].object_from_world)

@@ -33,9 +33,9 @@ class EditedSurface:
         return self.run.fields if self.edited is None else self.edited
 
     @property
-    def detail(self) -> Detail | None:
-        """The run's detail; None after smoothing, which takes what is finer than it."""
-        return None if self.edit.smooth else self.run.detail
+    def details(self) -> tuple[Detail, ...]:
+        """The run's details; none after smoothing, which takes what is finer than it."""
+        return () if self.edit.smooth else self.run.details
 
     def reduced(self, faces: int | None) -> trimesh.Trimesh:
         """Return the mesh with about so many triangles (None: all), without the guess where that is cut away.

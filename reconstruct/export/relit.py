@@ -16,7 +16,7 @@ from capture.decode.limits import BrokenFile
 from capture.decode.panorama import read_panorama
 from capture.errors import ReconstructionError
 from capture.photos.photo import encode_srgb
-from reconstruct.detail.file import with_detail
+from reconstruct.detail.sample import with_detail
 from reconstruct.export.export import Contents, ExportOptions, OnProgress
 from reconstruct.export.film import checked_frames, checked_width, read_film, with_progress
 from reconstruct.export.video import write_film
@@ -85,7 +85,7 @@ def write_relit(run: StoredRun, path: Path, new: NewLight, width: int | None, on
     if new.orbit is not None:
         wide, tall = even(wide), even(tall)
     posed_camera = run.fields.posed_camera.resized(wide, tall)
-    view = with_detail(look(run.fields, None, posed_camera), run.detail, posed_camera.camera)
+    view = with_detail(look(run.fields, None, posed_camera), run.details, posed_camera.camera)
     if new.orbit is not None:
         write_film(path, with_progress(_turning(run, view, new), checked_frames(new.orbit), on_progress))
         return

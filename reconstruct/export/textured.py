@@ -157,16 +157,16 @@ def _baked(run: StoredRun, options: ExportOptions, on_progress: OnProgress) -> T
     small = surface.reduced(options.faces or FACES)
     size = options.texture or _size_for(run)
     on_progress(1, STEPS, f"unwrapping it and baking colour and normals, {size} x {size} pixels")
-    baked = bake(surface.fields, small, surface.mesh, size, surface.detail)
+    baked = bake(surface.fields, small, surface.mesh, size, surface.details)
     on_progress(2, STEPS, "writing it")
     return baked
 
 
 def _size_for(run: StoredRun) -> int:
     """Return the side of the texture (px), no finer than the surface's resolution."""
-    if run.detail is None:
+    if not run.details:
         return USUAL_TEXTURE
-    steps = -(-size_for(run.detail, run.mesh) // TEXTURE_STEP)
+    steps = -(-size_for(run.details, run.mesh) // TEXTURE_STEP)
     return min(max(TEXTURE_STEP * steps, USUAL_TEXTURE), LARGEST_UNASKED)
 
 

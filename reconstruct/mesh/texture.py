@@ -1,5 +1,6 @@
 """Unwrap a simplified mesh, and bake colour and normals of the full surface into textures."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -14,7 +15,8 @@ from torch.nn.functional import normalize
 
 from capture.photos.photo import encode_srgb
 from reconstruct.appearance.brdf import MetalRough
-from reconstruct.detail.file import Detail, DetailSample, detail_at
+from reconstruct.detail.file import Detail
+from reconstruct.detail.sample import DetailSample, detail_at
 from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import mesh_material
 from reconstruct.render.g_buffer import NEIGHBOURS, SAME_POINT, SeenMaterial, albedo_at, seen_material
@@ -73,9 +75,9 @@ def texel_width(mesh: trimesh.Trimesh, size: int) -> float:
     return float(np.sqrt(mesh.area / PACKED)) / size
 
 
-def size_for(detail: Detail, mesh: trimesh.Trimesh) -> int:
-    """Return the picture size, px, whose texels are as fine on the mesh as a detail's pixels."""
-    return int(np.ceil(texel_width(mesh, 1) / pixel_width(detail, mesh)))
+def size_for(details: Sequence[Detail], mesh: trimesh.Trimesh) -> int:
+    """Return the picture size, px, whose texels are as fine on the mesh as the finest detail's pixels."""
+    return int(np.ceil(texel_width(mesh, 1) / min(pixel_width(detail, mesh) for detail in details)))
 
 
 def pixel_width(detail: Detail, mesh: trimesh.Trimesh) -> float:
@@ -85,7 +87,7 @@ def pixel_width(detail: Detail, mesh: trimesh.Trimesh) -> float:
 
 
 def bake(
-    fields: Fields, mesh: trimesh.Trimesh, full: trimesh.Trimesh, size: int, detail: Detail | None = None
+    fields: Fields, mesh: trimesh.Trimesh, full: trimesh.Trimesh, size: int, details: Sequence[Detail] = ()
 ) -> TexturedMesh:
     """Bake colour and normals of the full surface into the textures of a mesh.
 
@@ -93,7 +95,7 @@ def bake(
         mesh: closed, world frame, close to the surface; its vertex normals are not used.
         full: the mesh that it was reduced from.
         size: px, both sides of both pictures.
-        detail: finer normals and albedo, where the photos show them.
+        details: finer normals and albedo, where the photos of some view show them.
     """
     origin, faces, uv = unwrap(mesh, size)
     vertices = np.asarray(mesh.vertices, np.float64)[origin]
@@ -103,9 +105,8 @@ def bake(
     normals = _vertex_normals(fields, vertices, faces, is_base)
     tangents = vertex_tangents(vertices, normals, uv, faces)
     face_of = _drawn(uv, faces, size)
-    if detail is not None:
-        detail = detail.reduced(texel_width(mesh, size) / pixel_width(detail, mesh))
-    sampler = _SurfaceSampler(fields, full, detail)
+    details = [detail.reduced(texel_width(mesh, size) / pixel_width(detail, mesh)) for detail in details]
+    sampler = _SurfaceSampler(fields, full, details)
     rows, columns = np.nonzero(face_of >= 0)
     base, normal_map = np.empty((len(rows), 3), np.uint8), np.empty((len(rows), 3), np.uint8)
     for first in range(0, len(rows), TEXELS_AT_ONCE):
@@ -253,9 +254,9 @@ def _in_frame(
 class _SurfaceSampler:
     """Samples colour and normal of the surface at any point."""
 
-    def __init__(self, fields: Fields, full: trimesh.Trimesh, detail: Detail | None):
+    def __init__(self, fields: Fields, full: trimesh.Trimesh, details: Sequence[Detail]):
         """Prepare the data that all points share."""
-        self._fields, self._detail = fields, detail
+        self._fields, self._details = fields, details
         self._seen_material: SeenMaterial = seen_material(fields)
         self._material: MetalRough | None = mesh_material(fields, full)
         self._vertices = KDTree(np.asarray(full.vertices)) if self._material is not None else None
@@ -272,9 +273,9 @@ class _SurfaceSampler:
         where = torch.from_numpy(on_surface).float()
         albedo = albedo_at(self._fields, self._seen_material, where, torch.ones(len(where), dtype=torch.bool)).numpy()
         base = albedo.clip(0, 1) if self._material is None else self._glossy_base(on_surface)
-        if self._detail is None:
+        if not self._details:
             return base, normals
-        at = detail_at(self._detail, self._fields.grid, where)
+        at = detail_at(self._details, self._fields.grid, where)
         return _finer(base, albedo, normals, at, flat, is_base)
 
     def _glossy_base(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -1,13 +1,16 @@
 """Stage "detail" of a run: read the full-size photos again, on the finished surface."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
+from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
-from reconstruct.detail.detail import estimate_illumination, solve_detail
-from reconstruct.detail.file import DETAIL, save_detail
+from reconstruct.detail.detail import OnProgress, estimate_illumination, solve_detail
+from reconstruct.detail.file import DETAIL, Detail, save_details
 from reconstruct.detail.full_photos import full_photos
 from reconstruct.fields import Fields
 from reconstruct.labels.multiple_lights import is_shared
+from reconstruct.run.solve_stage import AllPhotos, seen_views
 from reconstruct.run_folder.folder import RunFolder
 from reconstruct.scene import build_scene
 from reconstruct.source.options import LONG_SIDES, RunOptions
@@ -27,13 +30,61 @@ def detail_is_asked(source: Source, options: RunOptions) -> bool:
 
 
 def write_detail(
-    source: Source, options: RunOptions, run: RunFolder, photos: Photos, calibration: Calibration, fields: Fields
+    source: Source,
+    options: RunOptions,
+    run: RunFolder,
+    photos: AllPhotos,
+    calibrated: CalibratedViews,
+    fields: Fields,
 ) -> None:
-    """Write detail.safetensors, or log the reason why there is none.
+    """Write detail.safetensors, the detail of each view that has one; log the reason where a view has none.
+
+    Args:
+        photos: as read_views reads them, in the order of source.views().
 
     Raises:
         CaptureError: a photo can no longer be read.
     """
+    sources = {"" if own.capture is None else own.capture.name: own for own in source.views()}
+    seen = [view for lie in (calibrated, *calibrated.lies) for view in seen_views(source, photos, lie)]
+    by_name = {name: (photos, calibration) for name, photos, calibration in seen}
+    views, details = fields.views(), []
+    for number, view in enumerate(views):
+        own = by_name.get(view.view, seen[0][1:] if number == 0 else None)
+        if own is not None:
+            found = _of_view(sources.get(view.view, source), options, run, own, view, _reporter(run, number, views))
+            details += [] if found is None else [replace(found, view=number, object_from_world=view.object_from_world)]
+    if details:
+        save_details(details, fields, run.file(DETAIL))
+
+
+def _reporter(run: RunFolder, number: int, views: Sequence[Fields]) -> OnProgress:
+    """Return what logs the progress of one of the views, in at most LINES lines for all."""
+    lines, of_view = set(), f"{views[number].view}: " if len(views) > 1 else ""
+
+    def report(done: int, total: int, message: str) -> None:
+        line = LINES * (number * total + done) // (len(views) * total)
+        if line not in lines:
+            run.progress(STAGE, number * total + done, len(views) * total, of_view + message)
+        lines.add(line)
+
+    return report
+
+
+def _of_view(
+    source: Source,
+    options: RunOptions,
+    run: RunFolder,
+    own: tuple[Photos, Calibration],
+    fields: Fields,
+    report: OnProgress,
+) -> Detail | None:
+    """Return the detail of one view, or None and log why there is none.
+
+    Args:
+        source, own, fields: of the view: its folder, its photos and calibration, and the scene as it saw it.
+    """
+    photos, calibration = own
     assert photos.stack is not None
     scene = build_scene(photos.stack, calibration, LONG_SIDES[SMALL], mask=photos.mask)
     scene = replace(scene, ground_known=source.ground_is_known(options))
@@ -42,17 +93,8 @@ def write_detail(
     files = full_photos(photos.stack, scene.photo_names, dark, is_linear)
     if is_shared(scene):
         run.progress(message="photos under several lights at once are not read in full detail")
-        return
-    lines = set()
-
-    def report(done: int, total: int, message: str) -> None:
-        line = LINES * done // total
-        if line not in lines:
-            run.progress(STAGE, done, total, message)
-        lines.add(line)
-
+        return None
     detail = solve_detail(estimate_illumination(scene, fields), fields, calibration.camera, files, run.path, report)
     if detail is None:
         run.progress(message="no pixel of the photos sees the surface")
-    else:
-        save_detail(detail, fields, run.file(DETAIL))
+    return detail

@@ -34,7 +34,7 @@ from reconstruct.run.detail_stage import detail_is_asked, write_detail
 from reconstruct.run.machine import kernels_are_compiled
 from reconstruct.run.report_json import summary, versions
 from reconstruct.run.results import save_results, save_views_maps
-from reconstruct.run.solve_stage import AllPhotos, seen_views, solve
+from reconstruct.run.solve_stage import AllPhotos, solve
 from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder, content_hash
 from reconstruct.run_folder.once import Lazy, ResultFile, done_once, once
 from reconstruct.solve.backend import backend_name, solver_device
@@ -112,9 +112,7 @@ def _reconstruct(
             run,
             "detail",
             "reading normals and albedo from the whole photos",
-            lambda: write_detail(
-                source, options, run, *seen_views(source, photos.get(), calibration.get())[0][1:], solved.get()
-            ),
+            lambda: write_detail(source, options, run, photos.get(), calibration.get(), solved.get()),
             needs=photos,
         )
     if run.is_finished("solve"):  # a visitor of the page may have stopped it: then the same command goes on

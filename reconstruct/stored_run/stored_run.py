@@ -54,11 +54,16 @@ class StoredRun:
         return load_fields(self.run_dir / FIELDS)
 
     @cached_property
-    def detail(self) -> "Detail | None":
-        """Normals and albedo at the photos' own resolution, if they were read on this surface."""
-        from reconstruct.detail.file import load_detail
+    def details(self) -> "tuple[Detail, ...]":
+        """Normals and albedo at the photos' own resolution, of each view, if they were read on this surface."""
+        from reconstruct.detail.file import load_details
 
-        return load_detail(self.run_dir / DETAIL, self.fields)
+        return load_details(self.run_dir / DETAIL, self.fields)
+
+    @property
+    def detail(self) -> "Detail | None":
+        """The first view's of the details."""
+        return next((detail for detail in self.details if detail.view == 0), None)
 
     @cached_property
     def calibration(self) -> Calibration:

@@ -20,4 +20,4 @@ class Result:
     fields: Fields
     scale: PageScale  # page units per world length
     mesh: trimesh.Trimesh | None  # mesh.ply; None where it is missing or empty
-    detail: Detail | None = None  # of the photos' own pixels; None where the run has none
+    details: tuple[Detail, ...] = ()  # of the photos' own pixels, of each view; none where the run has none

@@ -207,15 +207,15 @@ class Page:
     def _show_result(self) -> None:
         from viewer.display.result import Result
 
-        run, mesh, detail = StoredRun(self.follower.path), self._final_mesh, None
+        run, mesh, details = StoredRun(self.follower.path), self._final_mesh, ()
         fields, calibration = self._kept.get(run.run_dir / FIELDS, lambda: run.fields), run.calibration
         try:
             if mesh is not None:
                 refuse_far_mesh(mesh, fields, run.run_dir)
-            detail = self._kept.get(run.run_dir / DETAIL, lambda: run.detail)
+            details = self._kept.get(run.run_dir / DETAIL, lambda: run.details)
         except UserError as error:  # the rest of the result is there
             self.problem = str(error)
-        self.tabs.show(Result(run.run_dir, calibration, fields, self._scale, mesh, detail))
+        self.tabs.show(Result(run.run_dir, calibration, fields, self._scale, mesh, details))
         self._show_photo(self.controls.pictures.photo_index())
         self._show_layers()
         give_memory_back()  # of the previous result, if the same folder is run again

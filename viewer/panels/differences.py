@@ -60,9 +60,9 @@ class DifferencesPanel:
 
             name = result.calibration.lights[index].photo
             photo = self._follower.thumbnail(name)
-            return (
-                None if photo is None else compare_result(result.fields, result.calibration, name, photo, result.detail)
-            )
+            if photo is None:
+                return None
+            return compare_result(result.fields, result.calibration, name, photo, result.details)
 
         self._compare, self._is_beside_run = compared, False
         self._ask()

@@ -69,7 +69,7 @@ class LightPanel:
         with self._lock:
             self._result = result
             self._place = Viewpoint(result.fields.camera, result.fields.world_from_camera)
-            self._views, self._free_views = (ViewCache(result.fields, material, result.detail) for _ in range(2))
+            self._views, self._free_views = (ViewCache(result.fields, material, result.details) for _ in range(2))
             self._worker = RelightWorker(self._publish)
             if self._lamp is None:
                 if result.calibration.lights[0].position is None:

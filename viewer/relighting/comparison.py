@@ -1,6 +1,6 @@
 """Comparison: a photo, its computed picture and their difference, of a finished run or a snapshot of a running one."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,7 +8,8 @@ from jaxtyping import Float
 
 from calibration.calibration import Calibration
 from capture.photos.photo import decode_srgb, encode_srgb
-from reconstruct.detail.file import Detail, with_detail
+from reconstruct.detail.file import Detail
+from reconstruct.detail.sample import with_detail
 from reconstruct.fields import Fields
 from reconstruct.render.g_buffer import RenderView, look
 from reconstruct.render.photo_prediction import photographed, shadow_picture, snapshot, with_refined_lights
@@ -53,11 +54,11 @@ def as_bright_as(linear: Float[np.ndarray, "height width 3"], photo: Picture) ->
 
 
 def compare_result(
-    fields: Fields, calibration: Calibration, name: str, photo: Picture, detail: Detail | None = None
+    fields: Fields, calibration: Calibration, name: str, photo: Picture, details: Sequence[Detail] = ()
 ) -> Comparison | None:
     """Compare a photo of a finished run, by its name in the calibration, with its computed picture."""
     camera = fields.camera.resized(photo.shape[1], photo.shape[0])
-    view = with_detail(look(fields, posed_camera=replace(fields.posed_camera, camera=camera)), detail, camera)
+    view = with_detail(look(fields, posed_camera=replace(fields.posed_camera, camera=camera)), details, camera)
     return compare(photo, _computed(view, with_refined_lights(calibration, fields), name, photo))
 
 

@@ -1,13 +1,14 @@
 """RelightWorker: computes pictures of the newest request, a quick one at once and better ones afterwards."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from calibration.camera import Camera
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
-from reconstruct.detail.file import Detail, with_detail
+from reconstruct.detail.file import Detail
+from reconstruct.detail.sample import with_detail
 from reconstruct.fields import Fields
 from reconstruct.render.g_buffer import RenderView, SeenMaterial, look_steps
 from viewer.display.pictures import Picture
@@ -103,9 +104,9 @@ class RelightWorker:
 class ViewCache:
     """Views of a solved scene, kept by viewpoint and width, with the photos' full detail where the run has it."""
 
-    def __init__(self, fields: Fields, material: SeenMaterial, detail: Detail | None = None):
+    def __init__(self, fields: Fields, material: SeenMaterial, details: Sequence[Detail] = ()):
         """Compute nothing yet."""
-        self._fields, self._material, self._detail = fields, material, detail
+        self._fields, self._material, self._details = fields, material, details
         self._kept: list[tuple[Viewpoint, int, RenderView]] = []
 
     def steps(self, place: Viewpoint, width: int) -> Iterator[RenderView | None]:
@@ -118,7 +119,7 @@ class ViewCache:
         posed_camera = PosedCamera(camera, place.world_from_camera, self._fields.ground_height)
         for view in look_steps(self._fields, posed_camera, self._material):
             if view is not None:
-                view = with_detail(view, self._detail, camera)
+                view = with_detail(view, self._details, camera)
                 self._kept = [*self._kept, (place, width, view)][-VIEWS_KEPT:]
             yield view
 
