@@ -15,7 +15,8 @@ from scipy.sparse import csr_matrix
 
 from reconstruct.sdf.grid import SdfGrid
 
-STEPS = 12  # more change normals by less than a tenth of a degree
+STEPS = 16  # with MOMENTUM they do what 60 do without; more change normals by less than .02 degrees
+MOMENTUM = 0.8  # share of a move that the next one repeats [Polyak 1964, heavy ball]
 APART = 1.0  # voxels from a triangle to where its normal's differences are taken: shorter ones see single nodes' errors
 FARTHEST = 0.25  # voxels that a vertex may move: cells of the grid keep their sides
 SMOOTH = 0.85  # length of the gradient; below, faces meet at more than some 60 degrees: an edge, which stays as it is
@@ -29,10 +30,10 @@ def faced(
     faces: Int[np.ndarray, "m 3"],
     fixed: Bool[np.ndarray, " n"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Return the vertices after STEPS moves v += mean over its triangles of n n . (c - n d / 2 - v); world length.
+    """Return the vertices after STEPS moves v += m, m = mean over triangles of n n . (c - n d / 2 - v) + MOMENTUM m.
 
-    n is the triangle's wanted normal, c its centre, d the signed distance there. Normals and distances are taken once,
-    at the centres at the start; d then changes as n . c does.
+    World length. n is the triangle's wanted normal, c its centre, d the signed distance there. Normals and distances
+    are taken once, at the centres at the start; d then changes as n . c does.
 
     Args:
         fixed: vertices that stay.
@@ -46,12 +47,13 @@ def faced(
     planes = (around @ (wanted[:, :, None] * wanted[:, None, :]).reshape(-1, 9)).reshape(-1, 3, 3)
     fixed = fixed | ~_inside(grid, vertices)
     fixed[faces[~is_smooth]] = True
-    moved = vertices.copy()
+    moved, last = vertices.copy(), np.zeros_like(vertices)
     for _ in range(STEPS):
         level = (np.einsum("mi,mi->m", wanted, _centres(moved, faces)) + tangent) / 2
         towards = around @ (wanted * level[:, None])
         step = share * (towards - np.einsum("nij,nj->ni", planes, moved))
-        moved[~fixed] += step[~fixed]
+        last = np.where(fixed[:, None], 0.0, step + MOMENTUM * last)
+        moved += last
     way = moved - vertices
     length = np.linalg.norm(way, axis=1, keepdims=True)
     way *= np.minimum(1, FARTHEST * grid.spacing / np.maximum(length, 1e-12))
