@@ -13,7 +13,7 @@ from reconstruct.check.light_coverage import widest_gap
 from reconstruct.run_folder.folder import RunFolder
 from viewer.display.pictures import depth_picture, difference_picture, mesh_picture, normal_picture, reduced
 from viewer.report.figures import curves, lights_from_above
-from viewer.report.pictures import guess_facts
+from viewer.report.pictures import guess_facts, mesh_pictures
 from viewer.report.report import write_report
 
 
@@ -250,3 +250,17 @@ def test_the_headline_says_how_much_of_the_surface_is_a_guess():
     report = {"mesh": {"evidence": {"unconstrained": {"share": 0.234}}}}
     assert guess_facts(report)[0][0] == "23% a guess"
     assert guess_facts({}) == [] and guess_facts({"mesh": {}}) == []
+
+
+def test_each_picture_of_the_mesh_says_how_much_of_what_it_shows_is_known():
+    """A ball that is seen in front (y < 0) and held by shadows behind, but for a fifth of that, low down."""
+    ball = trimesh.creation.icosphere(4, 10.0)
+    y, z = ball.vertices[:, 1], ball.vertices[:, 2]
+    ball.vertex_attributes["evidence"] = np.where(y < 0, 2, np.where(z < -5, 0, 1)).astype(np.uint8)
+    said = re.findall(r"(\d+)% seen in the photos, (\d+)% held by shadows", mesh_pictures(ball, None))
+    front, right, left = ((int(seen), int(shadow)) for seen, shadow in said[::2])  # each caption is the alt text, too
+    assert front[0] > 85 and front[1] < 15
+    assert 10 < right[0] < 50 and right == pytest.approx(left, abs=1)
+    assert 40 < right[1] < 90 and sum(right) < 100
+    del ball.vertex_attributes["evidence"]
+    assert "seen in the photos" not in mesh_pictures(ball, None)

@@ -92,18 +92,34 @@ def view_from_camera(mesh: trimesh.Trimesh, calibration: Calibration | None) -> 
 
 
 def mesh_pictures(mesh: trimesh.Trimesh, calibration: Calibration | None) -> str:
-    """Return pictures of the mesh from the camera's side and from two sides that the camera does not see."""
+    """Return pictures of the mesh from the first camera's side and from two sides that it does not see."""
     way = view_from_camera(mesh, calibration)
     views = []
     for turn, size, caption in (
         (0, (640, 480), "From the camera's side"),
-        (120, (360, 270), "From behind, right: not in the photos, inferred from shadows and closed"),
+        (120, (360, 270), "From behind, right"),
         (-120, (360, 270), "From behind, left"),
     ):
         c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
         back = np.array([c * way[0] - s * way[1], s * way[0] + c * way[1], way[2]])
-        views.append(doc.figure(mesh_picture(mesh, back, size), caption))
+        views.append(doc.figure(mesh_picture(mesh, back, size), caption + _known_from(mesh, back)))
     return doc.row(views[0], f"<div>{views[1]}{views[2]}</div>", kind="wide-first")
+
+
+def _known_from(mesh: trimesh.Trimesh, way: Float[np.ndarray, "3"]) -> str:
+    """Return what is known of the surface that faces a viewer, for a caption; nothing where a run says nothing.
+
+    Args:
+        way: from the mesh to the viewer, world; any length.
+    """
+    kind = mesh.vertex_attributes.get("evidence")
+    if kind is None:
+        return ""
+    from reconstruct.mesh.evidence import SEEN, SHADOW
+
+    width = np.maximum(np.asarray(mesh.vertex_normals) @ way, 0)
+    seen, shadow = (float(width[np.asarray(kind) == one].sum() / max(width.sum(), 1e-12)) for one in (SEEN, SHADOW))
+    return f": {seen:.0%} seen in the photos, {shadow:.0%} held by shadows"
 
 
 def maps_part(maps: HasMaps | None, calibration: Calibration | None) -> str:
