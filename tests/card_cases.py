@@ -25,7 +25,7 @@ from reconstruct.torch_sdf.autograd import transmittance
 
 COARSE = FitConfig(levels=(Level(16, 3, (0.5, 0.4), 3, 5e-4), Level(24, 3, (0.4, 0.1), 2)), votes=1)
 MOVING = FitConfig(levels=(Level(16, 8, (0.5, 0.4), 3, 5e-4), Level(24, 8, (0.4, 0.1), 2)), votes=1)
-COLOUR = Look(width=40, height=30, n_lights=6)
+COLOUR = Look(width=40, height=30, n_lights=14)  # so many that each pixel has its own normal: fewer take minutes here
 SHADOW = replace(COLOUR, with_shadow=True, with_mask=True)
 CPU = torch.device("cpu")
 if os.environ.get("CARD") == "cuda":
