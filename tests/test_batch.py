@@ -116,6 +116,7 @@ def test_one_bad_capture_never_stops_the_rest_and_each_failure_says_why(tmp_path
     assert outcomes["good"].report["mesh"]["size"] == [10.0, 20.0, 30.0]
 
 
+@pytest.mark.slow
 def test_a_run_that_still_saves_in_its_folder_is_waited_for(tmp_path):
     (task,) = tasks_of(tmp_path, captures(tmp_path / "in", vase="fine"))
     leaving = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(2)"])

@@ -126,6 +126,7 @@ def test_a_wrong_number_of_frames_is_named(tmp_path, filmed, count):
         load_session(tmp_path)
 
 
+@pytest.mark.slow
 def test_frames_run_through_manifest_thumbnails_and_resuming_like_photos(tmp_path, filmed):
     (tmp_path / "capture").mkdir()
     (tmp_path / "capture" / "clip.mp4").symlink_to(filmed)

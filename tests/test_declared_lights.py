@@ -92,12 +92,14 @@ def test_four_pegs_halve_the_error_of_the_shading_and_the_result_says_how_well(p
     assert "5 of 5" in notes[0]
 
 
+@pytest.mark.slow
 def test_good_lights_are_left_good(pegs):
     sure = misplaced(pegs, 0.003)
     fine, _ = fuse_shadow_lights(sure, pegs.stack, POSED_CAMERA, PEGS)
     assert np.median(pegs.errors(fine.lights)) < 0.006
 
 
+@pytest.mark.slow
 def test_one_cube_gives_the_direction():
     truth = with_solids(photograph(Recipe(lights=handheld_lights(4, np.random.default_rng(3)), width=480)), (CUBE,))
     rough = misplaced(truth, 0.04)

@@ -33,6 +33,7 @@ def test_a_flashlight_that_never_moves_is_refused(by_mm):
         collect(truth.stack, POSED_CAMERA, every(truth))
 
 
+@pytest.mark.slow
 def test_copies_encoded_again_at_another_exposure_are_named_and_not_used():
     truth = photograph(Recipe(n_photos=8))
     rgb = truth.stack.rgb.copy()

@@ -45,6 +45,7 @@ def test_the_eight_functions_of_a_run_make_its_mesh_bit_for_bit(phone_run, tmp_p
         assert (tmp_path / "cow" / name).read_bytes() == (run / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_a_run_is_relit_as_a_film(phone_run, tmp_path):
     call("relight_run.py", phone_run[1], tmp_path / "cow.gif")
     with Image.open(tmp_path / "cow.gif") as film:
@@ -59,6 +60,7 @@ def test_what_is_known_of_a_mesh_can_be_counted_and_cut_out(phone_run, tmp_path,
     assert 0 < len(trimesh.load_mesh(tmp_path / "known.ply").faces) < len(whole.faces)
 
 
+@pytest.mark.slow
 def test_a_loss_of_ones_own_finds_a_ball_by_its_shadows():
     centre, radius = runpy.run_path(str(EXAMPLES / "own_shadow_loss.py"))["main"](steps=60)
     torch.testing.assert_close(centre, torch.tensor([1.8, 2.2, 1.7]), atol=0.03, rtol=0)

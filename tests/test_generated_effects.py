@@ -31,6 +31,7 @@ from examples.generator.options import (
 from examples.generator.sheet import lay
 
 BOARD = parse_board("charuco:5x7:30:22:DICT_4X4_50")
+pytestmark = pytest.mark.slow  # rendering takes half a minute
 LARGE_BOARD = "checkerboard:5x4:36"
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=40)
 

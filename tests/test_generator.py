@@ -72,6 +72,7 @@ def test_a_lens_puts_a_point_where_the_camera_projects_it():
     assert np.allclose(centre, camera.project(point)[0], atol=0.03)  # px; a wrong half pixel would be 0.25 or more
 
 
+@pytest.mark.slow
 def test_the_printed_corners_are_where_the_truth_says(capture):
     board = parse_board(BOARD)
     for entry in truth(capture, "board_photos")[:3]:
@@ -82,6 +83,7 @@ def test_the_printed_corners_are_where_the_truth_says(capture):
         assert off < 0.3
 
 
+@pytest.mark.slow
 def test_lit_ground_has_the_brightness_of_the_formula(capture):
     lights, camera = truth(capture, "lights"), truth(capture, "camera")["stored"]
     with np.load(capture / "gt" / "maps.npz") as maps:
@@ -148,6 +150,7 @@ def test_views_and_lies_see_one_object_whose_motion_is_known(tmp_path):
         assert np.abs(surface.query(points)[0]).max() < 1.5, name  # mm, between samples
 
 
+@pytest.mark.slow
 def test_the_capture_reads_as_a_session_and_the_moved_photo_is_marked(capture):
     session = load_session(capture)
     assert len(session.board) == 9 and len(session.lit) == 5
@@ -157,6 +160,7 @@ def test_the_capture_reads_as_a_session_and_the_moved_photo_is_marked(capture):
     assert header.exposure.iso == 250 and header.taken_s is not None
 
 
+@pytest.mark.slow
 def test_the_truth_scores_perfectly_against_itself(capture, tmp_path):
     camera, ground = truth(capture, "camera")["stored"], truth(capture, "ground")
     with np.load(capture / "gt" / "maps.npz") as maps:
@@ -179,6 +183,7 @@ def test_the_truth_scores_perfectly_against_itself(capture, tmp_path):
     assert scores["fscore_2pct"] > 0.99
 
 
+@pytest.mark.slow
 def test_a_used_folder_and_a_missing_mesh_are_refused(capture, tmp_path):
     from examples.generator.capturing import load_thing, make_capture
 
@@ -189,6 +194,7 @@ def test_a_used_folder_and_a_missing_mesh_are_refused(capture, tmp_path):
 
 
 @pytest.mark.parametrize("spec", ["paper:A4", "card"])
+@pytest.mark.slow
 def test_the_edges_of_a_blank_board_are_rendered_where_the_truth_says(spec):
     pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install 'shadowgraph[generator]'")
     from examples.generator import poses

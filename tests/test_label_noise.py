@@ -20,6 +20,7 @@ def noisy(clean: Scene) -> Scene:
     return replace(clean, shadow=torch.where(flipped, 1 - clean.shadow, clean.shadow))
 
 
+@pytest.mark.slow
 def test_wrong_pixels_of_shadow_pictures_carve_no_tunnels_through_the_hull():
     scene, _ = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=24))
     clean = replace(scene, rgb=None)

@@ -200,6 +200,7 @@ def test_a_motion_a_little_off_is_refined_on_rays_and_held_out_rays_agree(laid, 
     assert compare(surface, (start, rays), found).is_kept and not compare(surface, found, (start, rays)).is_kept
 
 
+@pytest.mark.slow
 def test_lights_that_are_all_too_high_pull_a_motion_less_where_they_may_be(laid, own_rays):
     scene, motion = laid
     about, surface = np.array([5.0, 0.0, 30.0]), grid_of(SHAPES)

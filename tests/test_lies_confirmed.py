@@ -64,6 +64,7 @@ def test_a_surface_of_all_meets_the_rays_of_each_lie_unless_a_motion_is_off(lies
     assert wrong.is_worse(1.5) and "turned_1" in wrong.numbers()
 
 
+@pytest.mark.slow
 def test_a_motion_that_is_off_is_refined_once_more_and_the_lie_is_kept(lies):
     motion = lying()[1]
     start = stepped(motion, np.array([0, 0, 0, 2.5, 2.0, 0]), MIDDLE)

@@ -47,6 +47,7 @@ def state_of(folder: Path) -> dict[str, tuple[int, int]]:
     return {str(path): (path.stat().st_mtime_ns, path.stat().st_size) for path in folder.rglob("*")}
 
 
+@pytest.mark.slow
 def test_a_run_in_folders_with_difficult_names_leaves_all_and_changes_nothing_in_the_input(run):
     capture, out, before = run
     assert state_of(capture) == before
@@ -54,6 +55,7 @@ def test_a_run_in_folders_with_difficult_names_leaves_all_and_changes_nothing_in
     assert json.loads((out / "report.json").read_text())["capture"] == "ball"
 
 
+@pytest.mark.slow
 def test_a_finished_run_exports_and_bundles_without_photos_and_personal_paths(run, tmp_path, monkeypatch, capsys):
     _, out, _ = run
     home = out.parents[3]
@@ -89,6 +91,7 @@ def test_a_home_folder_of_any_system_loses_its_name(text, shown):
     assert without_paths(text, []) == shown
 
 
+@pytest.mark.slow
 def test_numbers_are_written_with_points_where_commas_are_usual(run, tmp_path):
     _, out, _ = run
     before = locale.setlocale(locale.LC_ALL)

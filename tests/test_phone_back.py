@@ -40,6 +40,7 @@ def test_led_and_lens_are_found_on_dark_and_bright_backs(tmp_path, shade):
     assert 0.5 < view.lenses[0].sigma_mm < 1.2
 
 
+@pytest.mark.slow
 def test_all_lenses_are_candidates_from_a_slant_too(tmp_path):
     slanted = look_at((140.0, -330.0, 420.0), (140.0, -80.0, 0.0))
     view = read(tmp_path, THREE, world_from_camera=slanted)
@@ -60,6 +61,7 @@ def test_the_axes_are_those_of_a_phone_that_lies_top_to_top():
     np.testing.assert_allclose(in_lens_frame((turned[0], turned[1]), 1), expected, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_shading_tells_the_main_lens_of_three(tmp_path):
     true = in_lens_frame((10.0, 8.0), 0)  # the second lens of a phone that points to the board's top
     fitted = true + np.array([1.5, -2.0, 4.0])  # as well as the shading tells
@@ -110,6 +112,7 @@ def test_what_cannot_be_told_is_refused_with_what_to_do(tmp_path, phone, said):
         read(tmp_path, phone)
 
 
+@pytest.mark.slow
 def test_what_session_toml_names_is_not_searched(tmp_path):
     found = read(tmp_path, BackOfPhone())
     unlit = BackOfPhone(is_lit=False, lenses=())

@@ -70,6 +70,7 @@ def test_jobs_run_one_after_the_other_in_their_order_and_say_how_they_ended(tmp_
     assert bad.sentence == "no photos found in it. Put some there."
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_when_the_keeper_of_its_queue_is_killed_and_the_next_one_takes_it_up(tmp_path, program):
     keeper = (
         "import sys, time; from pathlib import Path; from reconstruct.run.queue import Queue\n"

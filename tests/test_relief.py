@@ -78,6 +78,7 @@ def test_photos_of_bumpy_ground_show_ground_and_object(truth):
     assert told.mean() > 0.8
 
 
+@pytest.mark.slow
 def test_the_hull_holds_the_ball_and_no_bump(truth):
     scene = scene_of(truth, "photos")
     grid = shadow_hull(scene, Observer(scene).ground_labels(), votes=1, nodes=40)

@@ -121,6 +121,7 @@ def test_what_goes_wrong_is_said_on_the_page(panel, run, tmp_path):
 
 
 @pytest.mark.browser
+@pytest.mark.slow
 def test_a_visitor_downloads_a_mesh(browser, run, tmp_path):
     followed = Followed(run)
     tab, bad = open_page(browser, followed.url, is_drawn=False)

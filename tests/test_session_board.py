@@ -56,6 +56,7 @@ def test_a_tripod_photo_without_the_named_board_says_what_it_shows(tmp_path):
         fit_board(one, "checkerboard:9x6:20")
 
 
+@pytest.mark.slow
 def test_a_board_stored_mirrored_is_named_as_such(tmp_path):
     one = session(tmp_path, [look_at((150.0, -420.0, 380.0))])
     cv2.imwrite(str(one.board[0]), np.fliplr(cv2.imread(str(one.board[0]))).copy())

@@ -118,6 +118,7 @@ def test_a_glossy_table_is_noticed_and_its_highlights_left_out():
     assert errors[1] < errors[0]
 
 
+@pytest.mark.slow
 def test_beams_that_are_not_round_are_noticed_and_cost_little():
     truth = photograph(Recipe(asymmetry=0.03))
     found = locate_lights(truth.stack, POSED_CAMERA, every(truth.stack))
@@ -148,8 +149,11 @@ def test_of_many_photos_fewer_cells_are_kept_evenly_spread(truth):
 
 @pytest.mark.parametrize(
     "curve",
-    [{"tone": 1.25}, {"tone": 0.85}, {"contrast": 0.15}],
-    ids=["steeper by a quarter", "flatter by a seventh", "S-shaped"],
+    [
+        pytest.param({"tone": 1.25}, id="steeper by a quarter"),
+        pytest.param({"tone": 0.85}, id="flatter by a seventh", marks=pytest.mark.slow),
+        pytest.param({"contrast": 0.15}, id="S-shaped", marks=pytest.mark.slow),
+    ],
 )
 def test_a_tone_curve_that_is_not_the_assumed_one_is_covered_by_the_stated_sigmas(curve):
     steep = photograph(Recipe(n_photos=12, **curve))
@@ -192,6 +196,7 @@ def test_a_light_whose_power_stands_out_is_less_sure_of_its_distance(truth):
     assert np.sqrt(grown[0]) == pytest.approx(0.04 * distance[0], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_hot_beam_misplaces_all_lights_together_and_the_error_of_the_beam_tells(truth):
     """A hot centre, 40 % brighter within some 20 degrees of the axis, that a smooth beam cannot follow."""
     evidence, _ = collect(truth.stack, POSED_CAMERA, every(truth.stack))

@@ -87,6 +87,7 @@ def test_every_camera_sees_the_surface(solved):
     assert share > 0.7 > 0.5 > alone  # the base, which stands on the ground, is a fifth
 
 
+@pytest.mark.slow
 def test_one_view_in_a_tuple_is_one_view(views):
     scene = views[0][1]
     short = replace(QUICK, levels=(replace(QUICK.levels[0], iterations=4),))

@@ -202,6 +202,7 @@ def test_it_opens_from_a_file_shows_the_object_and_asks_nobody(tab, page_file):
 
 
 @pytest.mark.browser
+@pytest.mark.slow
 def test_a_place_that_is_tapped_says_which_view_shows_it(tab, ours):
     shown(tab, {"focal": FOCAL_HEIGHTS, "shift": [0, 0]}, LAMP)
     tab.evaluate("document.querySelector('#panel').style.display = ''")
@@ -253,6 +254,7 @@ def test_the_light_follows_the_mouse_and_dragging_turns_the_view(tab):
 
 
 @pytest.mark.browser
+@pytest.mark.slow
 def test_a_large_lamp_makes_a_soft_edge(tab):
     hard = shown(tab, VIEW, LAMP, 4).astype(int).sum(-1)
     soft = shown(tab, VIEW, LAMP | {"radius": 90.0}, 4).astype(int).sum(-1)
@@ -262,6 +264,7 @@ def test_a_large_lamp_makes_a_soft_edge(tab):
 
 
 @pytest.mark.browser
+@pytest.mark.slow
 def test_cutting_away_the_object_shows_and_undo_brings_it_back(tab):
     before = shown(tab, VIEW, LAMP).astype(int)
     tab.evaluate("document.getElementById('crop-high-2').value = '20'")  # everything above 20 mm

@@ -63,6 +63,7 @@ def messages(run) -> list[str]:
     return [line["message"] for line in read_log(run.path / "log.jsonl")]
 
 
+@pytest.mark.slow
 def test_a_pause_changes_nothing_but_the_clock(tmp_path, scene, straight):
     with RunFolder(tmp_path / "run") as run:
         start = time.monotonic()

@@ -99,6 +99,7 @@ def test_the_keyboard_alone_makes_renames_and_deletes_a_capture(browser, tmp_pat
     assert not (tmp_path / "captures" / "Blue-vase").exists()
 
 
+@pytest.mark.slow
 def test_a_phone_that_left_in_the_middle_is_said_on_the_page_and_can_be_gone_on_without(browser, tmp_path):
     capture_in(tmp_path, "vase")
     with served(tmp_path) as (_, _, owner):
@@ -117,6 +118,7 @@ def test_a_phone_that_left_in_the_middle_is_said_on_the_page_and_can_be_gone_on_
         assert not bad
 
 
+@pytest.mark.slow
 def test_back_closes_a_dialog_with_the_page_that_opened_it(browser, tmp_path):
     capture_in(tmp_path, "vase")
     with served(tmp_path) as (_, _, owner):
@@ -156,6 +158,7 @@ def test_names_of_strangers_are_text_and_mistakes_are_sentences(browser, tmp_pat
         assert not [text for text in bad if "400" not in text]
 
 
+@pytest.mark.slow
 def test_cards_are_searched_renamed_and_compared_and_a_result_is_saved(browser, finished_run, tmp_path):
     (tmp_path / "runs").mkdir()
     for name in ("one", "two"):
@@ -215,6 +218,7 @@ def test_the_coach_speaks_once_and_shakes_for_a_photo_that_is_bad(browser, tmp_p
     assert said == [["IMG_1.jpg: blurred. Take it again. Next: lower, from the left.", "Done."], 1]
 
 
+@pytest.mark.slow
 def test_a_page_says_that_the_studio_is_gone_and_that_it_is_back(browser, tmp_path):
     capture_in(tmp_path, "vase")
     with served(tmp_path) as (_, _, owner):

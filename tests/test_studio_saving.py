@@ -41,6 +41,7 @@ def address(name: str, size: str = "") -> str:
     return f"/download?key={quote(RUN)}&format={name}&size={size}"
 
 
+@pytest.mark.slow
 def test_a_run_is_saved_for_printing_in_the_size_that_was_asked_for(folder):
     with served(folder) as (_, _, owner):
         rows = {row["name"]: row for row in owner.get("/api/formats")[1]}
@@ -57,6 +58,7 @@ def test_a_run_is_saved_for_printing_in_the_size_that_was_asked_for(folder):
         assert Client(owner.port).raw("GET", address("stl", "40")).status == 401
 
 
+@pytest.mark.slow
 def test_several_files_come_as_one_archive_and_are_forgotten_by_the_next_studio(folder):
     with served(folder) as (_, _, owner):
         found = made(owner, "normal-png")
@@ -102,6 +104,7 @@ def test_a_video_says_how_far_it_is_lets_others_pass_and_is_cancelled(folder):
         wait_until(lambda: (row_of(owner, "turntable").get("share") or 0.0) > 0.0)  # after a cancelled one
 
 
+@pytest.mark.slow
 def test_a_file_that_failed_keeps_its_sentence_until_it_is_asked_for_anew(folder):
     with served(folder) as (_, _, owner):
         owner.ok("save", key=RUN, format="3mf", size="0")

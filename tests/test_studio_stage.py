@@ -72,6 +72,7 @@ def test_a_damaged_pack_or_one_of_another_solve_counts_as_none(folder, tmp_path)
 
 @pytest.mark.browser
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.slow
 def test_a_note_made_in_the_studio_is_kept_with_the_run_and_goes_with_its_export(browser, folder, tmp_path):
     run = folder / "runs" / "heap"
     with served(folder) as (_, _, owner):

@@ -75,6 +75,7 @@ def check(folder: Path, files: dict[str, bytes]) -> None:
     assert there == {name: hashlib.sha256(content).digest() for name, content in files.items()}
 
 
+@pytest.mark.slow
 def test_photos_arrive_whole_and_once_though_connections_drop_and_the_server_is_killed(tmp_path):
     files = photos(6, 1 << 20)
     assert send_all(tmp_path, files, drops=3, kills=1) == (3, 1)

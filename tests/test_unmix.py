@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from synthetic import BALL, Look, render
 
@@ -46,6 +47,7 @@ def test_shadow_edges_that_run_past_do_not_change_the_coverage():
     assert torch.allclose(mask[12:18, 20:23], covered[12:18, 20:23], atol=0.05)
 
 
+@pytest.mark.slow
 def test_a_round_object_is_covered_as_far_as_its_outline():
     scene, truth = render((BALL,), Look(width=480, height=360, n_lights=20))
     small, _ = render((BALL,), Look(width=120, height=90, n_lights=20))

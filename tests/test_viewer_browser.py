@@ -95,6 +95,7 @@ def choose(tab, label: str, option: str) -> None:
     tab.get_by_role("option", name=option, exact=True).click()
 
 
+@pytest.mark.slow
 def test_the_scene_shows_the_computed_picture_from_where_the_visitor_stands(finished):
     _, tab, _ = finished
     wait_until(tab, lambda: brown_pixels(tab) > 2000)
