@@ -19,9 +19,9 @@ from calibration.camera import Camera
 from calibration.light import Light
 from calibration.posed_camera import PosedCamera
 from capture.errors import ReconstructionError
-from capture.photos.photo import decode_srgb
+from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.export.export import export
-from reconstruct.export.stage_scene import filled, stage_scene
+from reconstruct.export.stage_scene import filled, ground_pictures, stage_scene
 from reconstruct.render.g_buffer import look
 from reconstruct.render.relight import lit_share, relight
 from reconstruct.render.studio import FILL_LIGHT, FOCAL_HEIGHTS, Studio, looking_at, studio_of, towards
@@ -55,6 +55,19 @@ def stage(run) -> Studio:
 
 
 # --- what the page is told ---------------------------------------------------------------------------------------
+
+
+def test_ground_that_no_photo_lights_continues_the_ground_around_it():
+    albedo = np.full((60, 80, 3), 0.5, np.float32)
+    albedo[20:24, 30:36] = 0  # under a belly
+    ground = np.ones((60, 80), bool)
+    ground[30:50, 30:50] = False  # the object
+    albedo[30:50, 30:50] = [0.9, 0.1, 0.1]
+    picture, mean = ground_pictures(albedo, ground)
+    grey = encode_srgb(np.full(3, 0.5, np.float32))
+    assert np.abs(picture.astype(int) - grey).max() <= 1 and np.abs(mean.astype(int) - grey).max() <= 1
+    black, mean = ground_pictures(np.zeros_like(albedo), ground)  # all of it: nothing better is known
+    assert not black.any() and not mean.any()
 
 
 def test_cameras_and_lights_of_another_lie_are_told_in_the_frame_of_the_surface(tmp_path):

@@ -67,7 +67,7 @@ def stage_scene(run: StoredRun) -> StageScene:
     ground = np.asarray(binary_erosion(finite & ~mask, np.ones((3, 3), bool), border_value=1), bool)
     gloss, scale = _gloss(fields, vertices, seen_material(fields))
     picture, window, normal_picture = _object_pictures(fields, mask, run.detail)
-    whole, mean = _ground(fields.albedo.numpy(), ground)
+    whole, mean = ground_pictures(fields.albedo.numpy(), ground)
     return StageScene(
         vertices,
         _normals(fields, small),
@@ -186,10 +186,15 @@ def detail_pictures(detail: Detail) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[n
     return encode_srgb(albedo), np.round(127.5 * (normals + 1)).astype(np.uint8)
 
 
-def _ground(
+def ground_pictures(
     albedo: Float[np.ndarray, "height width 3"], ground: Bool[np.ndarray, "height width"]
 ) -> tuple[UInt8[np.ndarray, "rows columns 3"], UInt8[np.ndarray, "3"]]:
-    """Return the ground's albedo on the photo's grid, without what the object hides, and its mean."""
+    """Return the ground's albedo on the photo's grid, without what the object hides and no light reaches, and its mean.
+
+    Where no photo lights the ground, under a belly and beyond a table's edge, its albedo is exactly 0.
+    """
+    if (ground & albedo.any(-1)).any():
+        ground = ground & albedo.any(-1)
     mean = albedo[ground].mean(0) if ground.any() else np.full(3, 0.5, np.float32)
     hidden = np.asarray(binary_dilation(~ground, iterations=2), bool)
     known = ~hidden if (~hidden).any() else ground
