@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from jaxtyping import Float
+from scipy import ndimage
 from torch import Tensor
 
 from calibration.light import Light, irradiance
@@ -18,6 +19,7 @@ from reconstruct.labels.highlights import (
     material_without_ground,
     matt_photos,
     surface_appearance,
+    with_lit_ground,
     without_highlights,
 )
 from reconstruct.labels.photometric_stereo import label_object
@@ -226,3 +228,26 @@ def test_no_lobe_is_made_up_that_no_photo_shows(seed):
     lit = (beside & (facing[..., 0] > 0.1)).float()
     found = fit_lobes(Samples(value, lit, torch.ones_like(value), torch.zeros_like(value), towards, eye, normals))
     assert torch.allclose(facing_reflectance(found.coefficients), torch.tensor(0.06), rtol=0.25)
+
+
+def test_ground_without_a_lit_label_gets_its_albedo_where_the_surface_lets_light_arrive():
+    """The labels of a print's edges fail; ground that the ball shades from every light stays unknown."""
+    scene, truth = render((BALL,), Look(width=96, height=72, n_lights=3, texture=0.2, ambient=0.05))
+    assert scene.rgb is not None
+    once = {"lights": scene.lights, "power": scene.power, "rgb": scene.rgb}  # three photos under one light
+    scene = replace(scene, **{name: value[:1].expand_as(value) for name, value in once.items()})
+    axis = np.arange(-56.0, 57.0, 2.0)
+    nodes = np.stack(np.meshgrid(axis, axis, axis + 48, indexing="ij"), -1)
+    values = torch.from_numpy(np.linalg.norm(nodes - np.array(BALL.centre), axis=-1) - BALL.radius).float()
+    grid = SdfGrid(values, torch.tensor([-56.0, -56.0, -8.0]), 2.0)
+    points = torch.from_numpy(np.where(np.isfinite(truth.depth)[..., None], truth.points, np.nan)).float()
+    normals = torch.from_numpy(np.where(truth.mask[..., None], truth.normals, 0.0)).float()
+    ground = np.isfinite(truth.depth) & ~truth.mask
+    true = torch.from_numpy(truth.albedo).float()
+    missing = torch.from_numpy(ground)[..., None]
+    found = with_lit_ground(scene, grid, points, normals, torch.where(missing, 0.0, true)).numpy()
+    shade = ground & (ndimage.maximum_filter(truth.visibility[0], 5) == 0)
+    light = ground & (ndimage.minimum_filter(truth.visibility[0], 5) == 1)
+    assert shade.sum() > 50 and not found[shade].any()
+    assert np.median(np.abs(found / truth.albedo - 1)[light]) < 0.02
+    assert np.array_equal(found[truth.mask], truth.albedo[truth.mask].astype(np.float32))

@@ -23,7 +23,7 @@ from reconstruct.appearance.lobe_fit import (
     usual_scale,
 )
 from reconstruct.labels.photometric_stereo import ObjectLabels
-from reconstruct.scene import Scene
+from reconstruct.scene import Scene, irradiance
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
 from reconstruct.shading.noise import DEFAULT_NOISE
@@ -33,6 +33,7 @@ SURE_LABEL = 0.2  # confidence of a shadow label
 SURELY_LIT = 0.9  # of the light arrives: penumbras and shadow edges are left out
 PIXELS_AT_ONCE, USUAL_PHOTOS = 16384, 40  # stay below 60 MB; of more photos, fewer pixels
 JOINT_PIXELS = 1500  # that lobes, powers and normals are fitted to together
+DUST = 1e-9
 FEWEST_LIT = 3  # photos behind an albedo: with fewer, the albedo of the nearest known pixel is used
 
 
@@ -164,6 +165,35 @@ def surface_appearance(
         known[pixels] = own.weight.sum(1) >= FEWEST_LIT
     albedo, scale = _filled(albedo, known, where), _filled(scale[..., None], known, where)
     return albedo, Gloss(lobes.coefficients[None], scale) if lobes.coefficients.any() else None
+
+
+def with_lit_ground(
+    scene: Scene,
+    grid: SdfGrid,
+    points: Float[Tensor, "height width 3"],
+    normals: Float[Tensor, "height width 3"],
+    albedo: Float[Tensor, "height width 3"],
+) -> Float[Tensor, "height width 3"]:
+    """Return the albedo with that of ground in which the ground test found no lit sample, such as edges of print.
+
+    It is the median of I_k / (E_k + ambient) over the photos whose light reaches the place past the surface; where none
+    does, the albedo stays 0.
+
+    Args:
+        points, normals: what each pixel sees, world; normal 0 on the ground.
+    """
+    if scene.rgb is None or not scene.ground_known:
+        return albedo
+    where = (albedo == 0).all(-1) & (normals == 0).all(-1) & points.isfinite().all(-1)
+    out = albedo.clone()
+    for row, column in _blocks(where, len(scene.lights)):
+        at = points[row, column]
+        towards, strength = irradiance(scene, at)
+        expected = towards[..., 2:].clamp(min=0) * strength + scene.ambient
+        ratio = scene.rgb[:, row, column] / expected.clamp(min=DUST)
+        is_lit = (unshadowed(grid, at, scene.lights) > SURELY_LIT)[..., None] & (expected > DUST)
+        out[row, column] = torch.where(is_lit, ratio, torch.nan).nanmedian(0).values.nan_to_num(0.0)
+    return out
 
 
 def _blocks(where: Bool[Tensor, "height width"], photos: int) -> Iterator[tuple[Tensor, Tensor]]:

@@ -19,6 +19,7 @@ from reconstruct.labels.highlights import (
     material_without_ground,
     matt_photos,
     surface_appearance,
+    with_lit_ground,
     with_powers,
     without_highlights,
 )
@@ -154,10 +155,10 @@ class Observer:
         read = partial(self._appearance, scene, points, normals, lit_pixels(scene, surface, points, normals))
         first = self._solved(surface, scene, *read(self._bounce(scene, points)))
         scale, indirect = self._between_surfaces(first, scene) if scene.ground_known else (0.0, None)
-        if indirect is None:
-            return first
-        albedo, gloss = read(indirect)
-        return replace(first, albedo=albedo, gloss=gloss, interreflection=scale)
+        if indirect is not None:
+            albedo, gloss = read(indirect)
+            first = replace(first, albedo=albedo, gloss=gloss, interreflection=scale)
+        return replace(first, albedo=with_lit_ground(scene, surface, points, normals, first.albedo))
 
     def _between_surfaces(self, solved: Fields, scene: Scene) -> tuple[float, Indirect | None]:
         """Return the true scale of the albedo, and the light between surfaces; 0 and None where none shows."""
