@@ -14,6 +14,7 @@ from calibration.light import Light, irradiance
 from reconstruct.appearance.brdf import LOBES, Material, facing_reflectance, metal_rough, specular
 from reconstruct.appearance.lobe_fit import Indirect, Samples, _non_negative, fit_lobes, from_endless_ground
 from reconstruct.fields import Fields, load_fields, save_fields
+from reconstruct.labels.ground_test import test_ground as check_ground
 from reconstruct.labels.highlights import (
     lit_pixels,
     material_without_ground,
@@ -245,7 +246,7 @@ def test_ground_without_a_lit_label_gets_its_albedo_where_the_surface_lets_light
     ground = np.isfinite(truth.depth) & ~truth.mask
     true = torch.from_numpy(truth.albedo).float()
     missing = torch.from_numpy(ground)[..., None]
-    found = with_lit_ground(scene, grid, points, normals, torch.where(missing, 0.0, true)).numpy()
+    found = with_lit_ground(scene, check_ground(scene), grid, points, normals, torch.where(missing, 0.0, true)).numpy()
     shade = ground & (ndimage.maximum_filter(truth.visibility[0], 5) == 0)
     light = ground & (ndimage.minimum_filter(truth.visibility[0], 5) == 1)
     assert shade.sum() > 50 and not found[shade].any()

@@ -193,8 +193,8 @@ def ground_pictures(
 
     Where no photo lights the ground, under a belly and beyond a table's edge, its albedo is exactly 0.
     """
-    if (ground & albedo.any(-1)).any():
-        ground = ground & albedo.any(-1)
+    lit = ground & albedo.any(-1)
+    ground = lit if lit.any() else ground
     mean = albedo[ground].mean(0) if ground.any() else np.full(3, 0.5, np.float32)
     hidden = np.asarray(binary_dilation(~ground, iterations=2), bool)
     known = ~hidden if (~hidden).any() else ground

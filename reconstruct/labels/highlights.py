@@ -19,11 +19,13 @@ from reconstruct.appearance.lobe_fit import (
     from_endless_ground,
     gather,
     highlights,
+    least_squares_albedo,
     point_materials,
     usual_scale,
 )
+from reconstruct.labels.ground_test import GroundTest
 from reconstruct.labels.photometric_stereo import ObjectLabels
-from reconstruct.scene import Scene, irradiance
+from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
 from reconstruct.shading.noise import DEFAULT_NOISE
@@ -33,7 +35,6 @@ SURE_LABEL = 0.2  # confidence of a shadow label
 SURELY_LIT = 0.9  # of the light arrives: penumbras and shadow edges are left out
 PIXELS_AT_ONCE, USUAL_PHOTOS = 16384, 40  # stay below 60 MB; of more photos, fewer pixels
 JOINT_PIXELS = 1500  # that lobes, powers and normals are fitted to together
-DUST = 1e-9
 FEWEST_LIT = 3  # photos behind an albedo: with fewer, the albedo of the nearest known pixel is used
 
 
@@ -169,6 +170,7 @@ def surface_appearance(
 
 def with_lit_ground(
     scene: Scene,
+    ground: GroundTest,
     grid: SdfGrid,
     points: Float[Tensor, "height width 3"],
     normals: Float[Tensor, "height width 3"],
@@ -176,23 +178,25 @@ def with_lit_ground(
 ) -> Float[Tensor, "height width 3"]:
     """Return the albedo with that of ground in which the ground test found no lit sample, such as edges of print.
 
-    It is the median of I_k / (E_k + ambient) over the photos whose light reaches the place past the surface; where none
-    does, the albedo stays 0.
+    It is fitted to the photos whose light reaches the place past the surface, with the test's gains. Where none does,
+    and beyond the ground's end, the albedo stays 0.
 
     Args:
         points, normals: what each pixel sees, world; normal 0 on the ground.
     """
-    if scene.rgb is None or not scene.ground_known:
+    if not scene.ground_known:
         return albedo
     where = (albedo == 0).all(-1) & (normals == 0).all(-1) & points.isfinite().all(-1)
-    out = albedo.clone()
-    for row, column in _blocks(where, len(scene.lights)):
-        at = points[row, column]
-        towards, strength = irradiance(scene, at)
-        expected = towards[..., 2:].clamp(min=0) * strength + scene.ambient
-        ratio = scene.rgb[:, row, column] / expected.clamp(min=DUST)
-        is_lit = (unshadowed(grid, at, scene.lights) > SURELY_LIT)[..., None] & (expected > DUST)
-        out[row, column] = torch.where(is_lit, ratio, torch.nan).nanmedian(0).values.nan_to_num(0.0)
+    for end in (ground.background, None if ground.field is None else ground.field.beyond):
+        where &= True if end is None else ~torch.as_tensor(end)
+    out, no_light = albedo.clone(), from_endless_ground(torch.zeros(len(scene.lights)))
+    for pixels in _blocks(where, len(scene.lights)):
+        at = points[pixels]
+        up = torch.tensor([0.0, 0.0, 1.0]).expand_as(at)
+        lit = unshadowed(grid, at, scene.lights) > SURELY_LIT
+        part = gather(scene, at, up, pixels, lit.float(), no_light)
+        arriving = part.strength * part.towards[..., 2:] + part.indirect
+        out[pixels] = least_squares_albedo(part.value, arriving * ground.gain[:, *pixels].T[..., None], part.weight)
     return out
 
 

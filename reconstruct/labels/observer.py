@@ -158,7 +158,7 @@ class Observer:
         if indirect is not None:
             albedo, gloss = read(indirect)
             first = replace(first, albedo=albedo, gloss=gloss, interreflection=scale)
-        return replace(first, albedo=with_lit_ground(scene, surface, points, normals, first.albedo))
+        return replace(first, albedo=with_lit_ground(scene, self._ground, surface, points, normals, first.albedo))
 
     def _between_surfaces(self, solved: Fields, scene: Scene) -> tuple[float, Indirect | None]:
         """Return the true scale of the albedo, and the light between surfaces; 0 and None where none shows."""
