@@ -13,16 +13,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from capture.checks.alignment import FEWEST_PHOTOS, REFERENCE_PX
+from capture.checks.alignment import FEWEST_PHOTOS, REFERENCE_PX, allowed_px
 from capture.checks.board_alignment import BOARD_OFF, MOVED, HomeView, board_rotation, home_view
 from capture.checks.check_stack import check_stack
 from capture.checks.finding import Finding
 from capture.checks.framing import NOT_COMPARED, framing_findings
-from capture.checks.picture_motion import Homography, Rotation
+from capture.checks.picture_motion import Angles, Homography, Rotation
 from capture.decode.exif import focal_in_pixels
 from capture.photos.photo import PhotoStack
 
 FARTHEST_PX = 12.0  # at REFERENCE_PX: a larger motion moves the camera's place as well
+ROLLED = 2.0  # a shift alone, found where the camera also rolled, may seem so many times as far
 REGISTERED, ANOTHER_SCENE = "registered", "another scene"  # kinds of finding
 NEAR_ENOUGH = 0.25  # px: a photo nearer than that is left as it is
 RINGING = 3  # px around a saturated one, into which moving back carries its colour
@@ -109,7 +110,7 @@ def _is_motion(finding: Finding) -> bool:
 
 def _registered(stack: PhotoStack, before: Finding | None, path: Path, motion: Homography) -> Finding:
     to_file = stack.full_width / stack.rgb.shape[2]
-    length = before.value if before else to_file * _shift_of(motion, stack)
+    length = to_file * _shift_of(motion, stack)
     limit = FARTHEST_PX * stack.full_width / REFERENCE_PX
     text = f"the view lay {length:.1f} px off, as after a tap on the phone; the photo was moved back and is used"
     return Finding(path, REGISTERED, text, length, limit, False, tuple(float(value) for value in motion.ravel()))
@@ -126,7 +127,8 @@ def _motions(
     stack: PhotoStack, found: Sequence[Finding], board: PhotoStack | None
 ) -> tuple[dict[int, Homography], Homography | None]:
     """Return the homographies of photos that lie off the group by little, and that of the board's photo if it does."""
-    limit = FARTHEST_PX * stack.full_width / REFERENCE_PX
+    farthest = FARTHEST_PX * stack.rgb.shape[2] / REFERENCE_PX
+    limit = ROLLED * FARTHEST_PX * stack.full_width / REFERENCE_PX
     near = [finding for finding in found if _is_motion(finding) and finding.value <= limit]
     moved = {finding.photo for finding in near if finding.drop}
     useless = {finding.photo for finding in found if finding.drop} - moved
@@ -134,25 +136,34 @@ def _motions(
     if not near or len(indices) < FEWEST_PHOTOS:
         return {}, None
     home, rotation = home_view(stack, indices, board), _rotation(stack)
-    own = {i: _own_motion(home, k, rotation) for k, i in enumerate(indices) if stack.paths[i] in moved}
-    own = {i: motion for i, motion in own.items() if np.isfinite(motion).all()}
+    turns = {i: _own_angles(home, k, rotation) for k, i in enumerate(indices) if stack.paths[i] in moved}
+    own = {i: rotation.homography(one) for i, one in _shared(turns, rotation.focal, home).items()}
+    own = {i: motion for i, motion in own.items() if _shift_of(motion, stack) <= farthest}
     if board is None or len(near) == len(moved):
         return own, None
     angles = board_rotation(board, home, rotation)
     return own, rotation.homography(angles) if np.isfinite(angles).all() else None
 
 
-def _own_motion(home: HomeView, photo: int, rotation: Rotation) -> Homography:
-    """The homography from the group's pixels to a photo's; NaN where nothing tells."""
-    alignment = home.alignment
-    start = rotation.from_shift(alignment.shifts[photo])
+def _own_angles(home: HomeView, photo: int, rotation: Rotation) -> Angles:
+    """The rotation from the group's view to a photo's; NaN where nothing tells."""
+    view, start = home.alignment.view, rotation.from_shift(home.alignment.shifts[photo])
     if not np.isfinite(start).all():
-        return np.full((3, 3), np.nan)
-    view = alignment.view
-    numbers, _ = alignment.points.refined(
+        return start
+    return home.alignment.points.refined(
         home.textures[photo], view.brightness[photo], view.others[photo], start, rotation
-    )
-    return rotation.homography(numbers) if np.isfinite(numbers).all() else np.full((3, 3), np.nan)
+    )[0]
+
+
+def _shared(turns: dict[int, Angles], focal: float, home: HomeView) -> dict[int, Angles]:
+    """Give photos whose rotations are alike their median one: after a tap the phone stays where it is.
+
+    One photo's light tells a shift along the grain of wood to some tenths of a pixel only.
+    """
+    known = {i: one for i, one in turns.items() if np.isfinite(one).all()}
+    near = allowed_px(home.textures[0]) / focal
+    alike = {i: [other for other in known.values() if np.linalg.norm(other - one) < near] for i, one in known.items()}
+    return {i: np.median(some, axis=0) for i, some in alike.items()}
 
 
 def _rotation(stack: PhotoStack) -> Rotation:

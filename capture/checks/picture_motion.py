@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 Shift = Float[np.ndarray, "2"]  # px of the stack, u and v; what the photo shows lies so far off
+Angles = Float[np.ndarray, "3"]  # of a rotation of the camera: its rotation vector, rad
 Homography = Float[np.ndarray, "3 3"]  # of pixels (u, v, 1) of the stack
 
 

@@ -32,7 +32,8 @@ POINTS = 15_000  # that a shift is refined with
 FEWEST_POINTS = 500
 STRONGER_THAN = 70  # percentile of gradients that points are taken from
 ALIKE = 0.5  # of a gradient's length, by which the halves may differ in it: else light made it
-STEPS, VOTES = 4, 3  # of the refinement; of its robust weights in each
+STEPS, VOTES = 30, 3  # of the refinement, at most; of its robust weights in each
+SETTLED_PX = 0.01  # the refinement ends with a step that moves no point by more
 CUT = 4.0  # sigmas at which a point has no vote (Tukey)
 BORDER = 4  # px
 BLOCKS = 8  # along each side of the picture, whose disagreement is the error
@@ -154,7 +155,8 @@ class Points:
             return np.full(len(start), np.nan), np.full((len(start), len(start)), np.nan)
         u, v = self.columns[lit].astype(np.float32), self.rows[lit].astype(np.float32)
         common = self.values[half][lit].astype(float)
-        along = np.einsum("pi,pij->pj", self.gradients[half][lit], motion.slopes(u, v))
+        moves = motion.slopes(u, v)
+        along = np.einsum("pi,pij->pj", self.gradients[half][lit], moves)
         slopes = np.concatenate([along, -common[:, None]], axis=1)  # the last: fainter or stronger
         numbers, step = start.copy(), np.zeros(len(start) + 1)
         weighted = off = slopes
@@ -168,6 +170,8 @@ class Points:
                 weighted = slopes * weight[:, None]
                 step = np.linalg.lstsq(weighted.T @ slopes, weighted.T @ (common - seen), rcond=None)[0]
             numbers = numbers + step[:-1]
+            if np.abs(moves @ step[:-1]).max() < SETTLED_PX:
+                break
         return numbers, self._covariance(slopes, weighted, off, self.block[lit])
 
     @staticmethod
