@@ -65,7 +65,7 @@ def test_photos_after_a_tap_are_moved_back_pan_tilt_and_roll(stack):
 
 
 def test_a_phone_that_rolled_on_a_wooden_table_is_moved_back():
-    """A shift alone explains a roll badly, and grain tells little along itself: from there the angles take many steps."""
+    """A shift alone explains a roll badly, and grain tells little along itself: the angles take many steps then."""
     rng, turn = np.random.default_rng(1), (0.0, 3.0, 7.0)
     table = lit_table.table(rng)
     grain = cv2.GaussianBlur(table, (0, 0), sigmaX=4, sigmaY=0.1)
