@@ -74,6 +74,16 @@ def test_shake_along_one_axis_is_found(stack, axis):
     assert dropped(findings) == [("IMG_5.jpg", "blurred")]
 
 
+def test_where_a_third_is_shaken_the_others_tell_what_is_usual():
+    """The strongly shaken ones must not widen what passes: the last is shaken less, and blurred all the same."""
+    rng = np.random.default_rng(3)
+    photos = lit_table.lit_photos(18, rng, lit_table.with_object(lit_table.table(rng)))
+    shaken = {1: 2.5, 4: 2.0, 7: 1.5, 10: 2.2, 13: 3.0, 16: 1.0}  # px; the others differ a little, too
+    soft = [cv2.GaussianBlur(one, (0, 0), shaken.get(k, 0.3 + 0.025 * (k % 9))) for k, one in enumerate(photos)]
+    findings = check_stack(lit_table.stack_of(soft))
+    assert dropped(findings) == [(f"IMG_{k}.jpg", "blurred") for k in shaken]
+
+
 def test_on_a_table_without_texture_nothing_is_said_about_blur_and_motion():
     rng = np.random.default_rng(2)
     plain = lit_table.stack_of(lit_table.lit_photos(N, rng, np.full((lit_table.HEIGHT, lit_table.WIDTH), 0.4)))

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from capture.photos.photo import decode_srgb, encode_srgb
+from capture.decode.exif import focal_in_pixels
+from capture.photos.photo import decode_srgb, encode_srgb, read_photo
 
 PHOTOS = 20  # of a case: one wrong photo in 20
 QUALITY = 95  # JPEG, of the photos that were altered
@@ -130,19 +131,21 @@ def _most(rng: np.random.Generator, is_step: bool) -> tuple[int, ...]:
 
 
 def _moved(px: float, is_step: bool, who: Callable[..., tuple[int, ...]] = _one_or_few) -> Callable[..., Case]:
-    """The view shifted by px, and turned a little, as when a tripod is pushed."""
+    """The camera turned about its centre so that the middle of the picture moves by px, and rolled a little."""
 
     def drawn(case: Case, source: Original, rng: np.random.Generator) -> Case:
         height, width = source.usual.shape[:2]
         shift = source.px(px)
         way, roll = rng.uniform(0, 2 * np.pi), rng.uniform(-1, 1) * ROLL * shift / (width / 2)
-        turn = cv2.getRotationMatrix2D((width / 2, height / 2), float(np.degrees(roll)), 1.0)
-        turn[:, 2] += shift * np.array([np.cos(way), np.sin(way)])
+        focal = focal_in_pixels(read_photo(source.photos[0]).focal_35mm, width, height)
+        matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+        angles = np.array([-np.sin(way) * shift / focal, np.cos(way) * shift / focal, roll])
+        turn = matrix @ cv2.Rodrigues(angles)[0] @ np.linalg.inv(matrix)
 
         def alter(place: int) -> Pixels:
             encoded = encode_srgb(source.pixels(case.chosen[place]))
             how = {"flags": cv2.INTER_LANCZOS4, "borderMode": cv2.BORDER_REFLECT}
-            return decode_srgb(cv2.warpAffine(encoded, turn, (width, height), **how))
+            return decode_srgb(cv2.warpPerspective(encoded, turn, (width, height), **how))
 
         bad = who(rng, is_step)
         return replace(case, size=f"{px:g} px", words=MOVED, bad=bad, altered=alter)

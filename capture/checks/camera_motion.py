@@ -164,16 +164,25 @@ def _blurred_or_another(path: Path, contrast: float, limit: float, own: float, c
 
 
 def _low_contrast(contrasts: Float[np.ndarray, "photos axes"]) -> dict[int, tuple[float, float]]:
-    """Contrast and limit of photos far below the others; an axis weighs the more the less the photos differ in it."""
+    """Contrast and limit of photos far below the others, once these are out of what the others are like.
+
+    An axis weighs the more the less the photos differ in it.
+    """
     axes = contrasts[:, np.isfinite(contrasts).any(0)]
     known = np.flatnonzero(np.isfinite(axes).any(1))
-    if len(known) < FEWEST_PHOTOS:
-        return {}
-    relative = axes[known] / np.nanmedian(axes, 0)
-    weights = np.where(np.isfinite(relative), 1 / (_spread(relative) ** 2 + CONTRAST_NOISE**2), 0)
-    values = (np.nan_to_num(relative) * weights).sum(1) / weights.sum(1)
-    limit = min(BLURRED, 1 - BLUR_SIGMAS * float(_spread(values[:, None])[0]))
-    return {int(k): (float(value), limit) for k, value in zip(known, values, strict=True) if value < limit}
+    found: dict[int, tuple[float, float]] = {}
+    while len(usual := np.setdiff1d(known, list(found))) >= FEWEST_PHOTOS:
+        relative = axes / np.nanmedian(axes[usual], 0)
+        trust = 1 / (_spread(relative[usual]) ** 2 + CONTRAST_NOISE**2)
+        weights = np.where(np.isfinite(relative), trust, 0)[known]
+        values = (np.nan_to_num(relative[known]) * weights).sum(1) / weights.sum(1)
+        others = values[np.isin(known, usual)]
+        limit = min(BLURRED, 1 - BLUR_SIGMAS * float(_spread(others[:, None])[0]))
+        low = {int(k): (float(value), limit) for k, value in zip(known, values, strict=True) if value < limit}
+        if low.keys() <= found.keys():
+            break
+        found |= low
+    return found
 
 
 def _spread(values: Float[np.ndarray, "photos columns"]) -> Float[np.ndarray, " columns"]:
