@@ -146,7 +146,7 @@ def test_a_varnished_table_shows_where_it_mirrors_the_lights(ball):
     field = GroundField(flat, 0 * excess, excess, np.ones(excess.shape, bool), flat + 1)
     likelihood = np.where(mask, 1.0, -1.0).astype(np.float32)
     shadows = GroundShadows(np.ones_like(excess), np.full(len(lights), -2.0), likelihood, mask)
-    spots = find_highlights(field, shadows, ground, np.ones(mask.shape, bool))
+    spots = find_highlights(field, shadows, ground)
     assert len(spots) >= 5
     half = [
         (lights[k] - p) / np.linalg.norm(lights[k] - p) + (EYE - p) / np.linalg.norm(EYE - p)
@@ -154,6 +154,23 @@ def test_a_varnished_table_shows_where_it_mirrors_the_lights(ball):
     ]
     lean = np.linalg.norm(np.array([one / np.linalg.norm(one) for one in half])[:, :2], axis=1)
     assert np.median(lean) < np.radians(1.0)
+
+
+def test_a_saturated_spot_at_the_border_is_found_and_one_whose_middle_is_out_of_sight_is_not(ball):
+    """Nor is a fainter one taken in its place; the first photo's is whole, which tells how high spots are."""
+    camera, _, _ = ball
+    ground, _ = ground_points(camera)
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    middles = [(WIDTH / 2, HEIGHT - 40.0), (80.0, HEIGHT - 8.0), (80.0, HEIGHT + 10.0)]
+    light = np.stack([3 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / 20**2) for x, y in middles]).astype(np.float32)
+    light[2] += 0.3 * np.exp(-((u - 50) ** 2 + (v - HEIGHT / 2) ** 2) / 10**2)
+    flat = np.zeros((HEIGHT, WIDTH), np.float32)
+    field = GroundField(flat, 0 * light, np.minimum(light, 1.2), light < 1, flat + 1)
+    shadows = GroundShadows(np.ones_like(light), np.full(len(light), -2.0), flat - 1, flat > 1)
+    spots = find_highlights(field, shadows, ground)
+    assert spots.photos.tolist() == [0, 1]
+    assert np.abs(camera.project(spots.points) - middles[:2]).max() < 2.5  # px
+    assert spots.sigma[1] > spots.sigma[0]
 
 
 def test_matt_tables_show_no_highlights(ball):
@@ -164,7 +181,7 @@ def test_matt_tables_show_no_highlights(ball):
     field = GroundField(flat, 0 * noise, noise, np.ones(noise.shape, bool), flat + 1)
     shadows = GroundShadows(np.ones_like(noise), np.full(len(lights), -2.0), flat - 1, flat > 1)
     ground, _ = ground_points(camera)
-    assert len(find_highlights(field, shadows, ground, np.ones(flat.shape, bool))) == 0
+    assert len(find_highlights(field, shadows, ground)) == 0
 
 
 def test_rows_are_derivatives_of_the_highlights_cost(ball):

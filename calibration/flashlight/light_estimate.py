@@ -43,6 +43,8 @@ from capture.photos.photo import PhotoStack
 
 DROP_RESIDUAL = 3.5  # of the median photo: shaken, or not lit by the flashlight
 DROP_SHARE = 0.4  # least share of the ground that must follow the model
+OTHER_POWER = 3.0  # factor between one flashlight's power in two photos
+POWER_SIGMAS = 6.0  # or in how much the other photos differ, where they do not tell their exposure
 LOWEST = 0.08  # of the camera's distance: no hand holds a flashlight lower
 RANGES = (0.2, 4.0)  # of the camera's distance
 LARGEST_SIGMA = 0.08  # of the range, before HONEST_SHARE
@@ -157,6 +159,8 @@ def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: l
     contradiction = np.zeros(len(reach)) if outlines is None else outlines.misfit(flashlights.positions)
     largest = LARGEST_SIGMA if outlines is None else LARGEST_JOINT_SIGMA
     height = flashlights.positions[:, 2] - fit.evidence.height
+    brighter = flashlights.log_power - np.median(flashlights.log_power)
+    too_bright = max(np.log(OTHER_POWER), POWER_SIGMAS * spread(brighter))
     reasons, duplicate = [], earlier_duplicate(fit.evidence)
     for k in range(len(reach)):
         why = []
@@ -172,6 +176,11 @@ def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: l
             why.append(f"the light would be {reach[k]:.0f} from the middle of the photo")
         if size[k] > largest:
             why.append(f"its place is uncertain by {size[k]:.0%} of its distance (limit {largest:.0%})")
+        if abs(brighter[k]) > too_bright:
+            why.append(
+                f"from there its flashlight would be {np.exp(brighter[k]):.2g} times as strong as in the other photos "
+                f"(limit {np.exp(too_bright):.2g})"
+            )
         if contradiction[k] > DROP_OUTLINE:
             why.append(
                 f"its shadow contradicts the other photos' by {contradiction[k]:.1f} px of a picture of "

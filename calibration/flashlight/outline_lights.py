@@ -34,9 +34,9 @@ from calibration.ground.ground_field import GroundField, at_photo_size, fit_grou
 from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows, find_shadows, of_one_ground
 from calibration.ground.mirror_highlights import find_highlights
 from calibration.ground.table_edges import TableEdge
-from calibration.lights.ground_cells import beyond_ends
+from calibration.lights.ground_cells import beyond_ends, ground_points
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
-from calibration.outlines.outline_maps import near_ground, outline_maps, with_cues
+from calibration.outlines.outline_maps import outline_maps, with_cues
 from calibration.outlines.relocate import likely_places
 from calibration.outlines.shadow_start import shadow_starts
 from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
@@ -130,8 +130,8 @@ def _terms(
     maps = with_cues(maps, cues, posed_camera)
     every = np.ones(maps.n_photos(), bool)
     whole = ~maps.is_cut & np.isin(np.arange(maps.n_photos()), maps.owner)
-    points, near = near_ground(maps, posed_camera, coarse.albedo.shape)
-    spots = find_highlights(coarse, find_shadows(coarse), points, near)
+    points, down = ground_points(posed_camera.resized(*coarse.albedo.shape[::-1]))
+    spots = find_highlights(coarse, find_shadows(coarse), np.where(down[..., None], points, np.nan))
     trusted = whole if whole.sum() >= FEWEST_WHOLE else every
     return OutlineTerms(maps, posed_camera.centre, posed_camera.ground_height, every, trusted, spots)
 

@@ -17,11 +17,15 @@ from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows
 
 BRIGHTEST = 1.0  # log units over the field: brighter counts as this, since the sensor clips there
 DULLEST, SIGMAS = 0.12, 4.0  # a spot's least height, log units and sigmas of the field's noise
+AS_HIGH = 0.5  # least height over that of the series' second highest: one table has one gloss
 BLUR = 2.0  # px of the ground field: grain of wood is finer
-SPOTS = 4  # places per photo that are looked at
+LEVELS = (0.5, 0.65, 0.8, 0.9)  # of a spot's height, at the first of which the picture does not cut it
+WHOLE = 0.05  # share of its rim there that may border on what is no ground or not in the picture
 SMALLEST = 20  # px of the ground field
-OPEN = 0.5  # share of a spot's rim that may border on what is no ground
-SPOT_ERROR = 0.012  # radians of the half vector: as two varnished tables show with lights that are known
+CUT = 0.3  # share of the rim of a saturated spot that may lie beyond the border, for an ellipse through the rest
+OPEN = 0.5  # share of a spot's rim at half its height that shadow or the object may hide
+SPOT_ERROR = 0.008  # radians of the half vector: as on six varnished tables with lights that are known
+SQUARE = np.ones((3, 3), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -36,62 +40,112 @@ class MirrorHighlights:
         return len(self.photos)
 
 
+@dataclass(frozen=True)
+class _Spot:
+    middle: Float[np.ndarray, "2"]  # row and column
+    height: float  # log units
+    hidden: float  # share of its rim
+
+
 def find_highlights(
-    field: GroundField,
-    shadows: GroundShadows,
-    points: Float[np.ndarray, "height width 3"],
-    near: Bool[np.ndarray, "height width"],
+    field: GroundField, shadows: GroundShadows, points: Float[np.ndarray, "height width 3"]
 ) -> MirrorHighlights:
-    """Return the spots of all photos. Those that the picture's border cuts are left out: their middle is unknown.
+    """Return the spots of all photos: of each the brightest, unless the picture's border cuts it.
 
     Args:
-        points: of the ground in each pixel, world.
-        near: where to look: on the ground, not far from the object.
+        points: of the ground in each pixel, world; nan where none is.
     """
-    hidden = cv2.dilate(shadows.object_mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    bare = near & ~hidden & (shadows.likelihood < GROUND_LIKE)
+    blocked = cv2.dilate(shadows.object_mask.astype(np.uint8), SQUARE) > 0
+    bare = ~blocked & (shadows.likelihood < GROUND_LIKE) & np.isfinite(points).all(-1)
+    if field.beyond is not None:
+        bare &= ~field.beyond
     least = max(DULLEST, SIGMAS * field.noise())
-    spots = []
+    spots = {}
     for photo, (residual, visibility) in enumerate(zip(field.residual, shadows.visibility, strict=True)):
         valid = bare & ((visibility > 0.5) | (residual > 0))
-        best = _brightest_spot(np.where(valid, np.clip(residual, -0.3, BRIGHTEST), 0), valid, least)
-        if best is not None:
-            weight, share = best
-            point = (weight[..., None] * np.where(weight[..., None] > 0, points, 0)).sum((0, 1)) / weight.sum()
-            spots.append((photo, point, SPOT_ERROR * (1 + 2 * share)))
-    photos, places, sigma = zip(*spots, strict=True) if spots else ((), (), ())
-    return MirrorHighlights(np.array(photos, int), np.array(places).reshape(-1, 3), np.array(sigma, float))
+        excess = np.where(valid, np.clip(residual, -0.3, BRIGHTEST), 0)
+        spot = _brightest_spot(excess.astype(np.float32), valid, ~field.usable[photo], least)
+        if spot is not None:
+            spots[photo] = spot
+    heights = sorted((spot.height for spot in spots.values()), reverse=True)
+    usual = heights[1] if len(heights) > 1 else 0.0
+    kept = {photo: spot for photo, spot in spots.items() if spot.height >= AS_HIGH * usual}
+    rows, columns = np.rint([spot.middle for spot in kept.values()]).astype(int).reshape(-1, 2).T
+    sigma = [SPOT_ERROR * (1 + 2 * spot.hidden) for spot in kept.values()]
+    return MirrorHighlights(np.array(list(kept), int), points[rows, columns], np.array(sigma, float))
 
 
-def _brightest_spot(excess: Float[np.ndarray, "height width"], valid: Bool[np.ndarray, "height width"], least: float):
-    """Return the weights of the pixels of the spot with the largest sum, and the open share of its rim; or None."""
+def _brightest_spot(
+    excess: Float[np.ndarray, "height width"],
+    valid: Bool[np.ndarray, "height width"],
+    clipped: Bool[np.ndarray, "height width"],
+    least: float,
+) -> _Spot | None:
+    """Return the spot with the largest sum; None where there is none, or its middle is out of sight."""
     known = cv2.GaussianBlur(valid.astype(np.float32), (0, 0), BLUR)
-    smooth = cv2.GaussianBlur(excess.astype(np.float32), (0, 0), BLUR) / np.maximum(known, 0.3)
+    smooth = cv2.GaussianBlur(excess, (0, 0), BLUR) / np.maximum(known, 0.3)
     smooth[~valid] = 0
-    wide, left, best = _pieces(smooth > 0.5 * least), smooth.copy(), None
-    for _ in range(SPOTS):
-        top = np.unravel_index(int(np.argmax(left)), left.shape)
-        if left[top] < least:
-            break
-        pieces = _pieces(smooth > 0.5 * left[top])
-        left[wide == wide[top]] = 0
-        spot = pieces == pieces[top]
-        rim = (cv2.dilate(spot.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~spot
-        open_share = float((rim & ~valid).sum() / max(rim.sum(), 1))
-        if spot.sum() < SMALLEST or open_share > OPEN or _at_border(spot):
-            continue
-        weight = np.where(spot, np.maximum(excess, 0), 0)
-        if best is None or weight.sum() > best[0].sum():
-            best = weight, open_share
-    return best
+    pieces = _pieces(smooth > LEVELS[0] * least)
+    sums = np.bincount(pieces.ravel(), np.maximum(excess, 0).ravel())
+    sums[0] = 0
+    if not sums.any():
+        return None
+    height, top = _highest(np.where(pieces == sums.argmax(), smooth, 0))
+    whole = _around(smooth > LEVELS[0] * height, top)
+    hidden = _share(_rim(whole) & np.pad(~valid, 1), _rim(whole))
+    core = clipped & whole
+    if height < least or hidden > OPEN or whole.sum() < SMALLEST:
+        return None
+    parts = [*(_around(smooth > level * height, top) for level in LEVELS), core]
+    cut = [_share(_rim(part) & ~np.pad(valid, 1), _rim(part)) if part.sum() >= SMALLEST else 1.0 for part in parts]
+    if not (_rim(core) & _frame(core)).any():
+        for part, share in zip(parts, cut, strict=True):
+            if share < (WHOLE + hidden if part is parts[0] else WHOLE):
+                return _Spot(_centroid(np.where(part, np.maximum(excess, 0), 0)), height, hidden)
+    elif cut[-1] < CUT:
+        middle = _ellipse_middle(_rim(core) & np.pad(valid, 1))
+        if all(0 <= one <= last - 1 for one, last in zip(middle, valid.shape, strict=True)):
+            return _Spot(middle, height, max(hidden, cut[-1]))
+    return None
+
+
+def _centroid(weight: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "2"]:
+    places = np.argwhere(weight > 0)
+    return np.average(places, axis=0, weights=weight[weight > 0])
+
+
+def _ellipse_middle(rim: Bool[np.ndarray, "height_and_2 width_and_2"]) -> Float[np.ndarray, "2"]:
+    """Return the middle, row and column, of the ellipse through what is seen of a rim."""
+    rows, columns = np.nonzero(rim)
+    (column, row), _, _ = cv2.fitEllipseDirect(np.stack([columns, rows], -1).astype(np.float32))
+    return np.array([row - 1, column - 1])
+
+
+def _highest(picture: Float[np.ndarray, "height width"]) -> tuple[float, tuple[int, int]]:
+    row, column = np.unravel_index(int(np.argmax(picture)), picture.shape)
+    return float(picture[row, column]), (int(row), int(column))
+
+
+def _around(inside: Bool[np.ndarray, "height width"], place: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
+    pieces = _pieces(inside)
+    return pieces == pieces[place]
+
+
+def _rim(inside: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height_and_2 width_and_2"]:
+    """Return the pixels around a region, in a picture that has one more on each side."""
+    padded = np.pad(inside, 1)
+    return (cv2.dilate(padded.astype(np.uint8), SQUARE) > 0) & ~padded
+
+
+def _frame(inside: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height_and_2 width_and_2"]:
+    return np.pad(np.zeros_like(inside), 1, constant_values=True)
+
+
+def _share(some: np.ndarray, of: np.ndarray) -> float:
+    return float(some.sum() / max(of.sum(), 1))
 
 
 def _pieces(inside: Bool[np.ndarray, "height width"]) -> Int[np.ndarray, "height width"]:
     pieces = np.empty(inside.shape, np.int32)
     label(inside, output=pieces)
     return pieces
-
-
-def _at_border(spot: Bool[np.ndarray, "height width"]) -> bool:
-    inner = spot[2:-2, 2:-2]
-    return bool(spot.sum() > inner.sum())

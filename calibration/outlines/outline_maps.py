@@ -120,16 +120,6 @@ def with_cues(maps: OutlineMaps, cues: MetricCues, posed_camera: PosedCamera) ->
     return replace(maps, space=proven_space(cues, outline, top, posed_camera, PIXEL_ERROR * maps.pixel))
 
 
-def near_ground(maps: OutlineMaps, posed_camera: PosedCamera, shape: tuple[int, ...]):
-    """Return the ground point of each pixel (world; nan above the horizon), and whether it lies within the maps' reach.
-
-    Args:
-        shape: height and width of the picture.
-    """
-    points, down = ground_points(posed_camera.resized(shape[1], shape[0]))
-    return points, down & (np.linalg.norm(points - maps.foot, axis=-1) < REACH * maps.size)
-
-
 @dataclass(frozen=True)
 class _Lookup:
     """Pictures seen from above: the value of a picture at each cell of the map."""
