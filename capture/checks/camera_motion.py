@@ -34,7 +34,9 @@ REPEATS = 0.7  # slope between the textures of the two halves; less is noise, an
 MISSING = 0.3  # slope of a cell's texture over the common one, below which something hides it
 STEADY = 0.8  # share of the lit photos that must show a cell's texture: else light makes it
 COVERED = 0.01  # of the picture, in one piece; good photos gave 0.4 % on the faintest grain
-OFTEN = 0.25  # of the photos: what hides texture in more of them is gloss, not a hand
+EDGE_ENERGY = 2.0  # squared texture in a cell over the usual: hands gave 17 and more at their edges, highlights 0.6
+HIGHLIGHT = 1.5  # brightness over that around: highlights gave 1.8 and more, hands 1.3 at most
+OFTEN = 0.5  # of the photos: what hides texture in more of them is light, not a hand
 SHARP = 0.85  # strength of a photo's own texture, over the usual; good photos gave 0.95 and more
 SOFT = 0.5  # likewise: shaken and unsharp photos had 0.2 and more, other scenes 0.9 and more
 COARSER = 8  # times smaller pictures, in which a blurred photo still shows what the others do
@@ -64,7 +66,7 @@ def view_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack |
             found.append(_blurred_or_another(path, *contrast, own, _coarse_match(stack, indices, k)))
         elif k in moved:
             found.append(_moved(stack, path, float(home.lengths[k]), float(limits[k]), *home.fault(path)))
-        elif (share := _hidden_share(shown[k], steady)) > COVERED:
+        elif (share := _hidden_share(view, k, shown[k], steady)) > COVERED:
             text = f"something that the other photos do not show covers at least {share:.0%} of the picture"
             found.append(Finding(path, "covered", f"{text}, {COVERED:.0%} may be", share, COVERED, True))
     many = sum(finding.kind == "covered" for finding in found) > OFTEN * len(indices)
@@ -229,11 +231,27 @@ def _cells(
     return shown, steady & (agree > SHOWN)
 
 
-def _hidden_share(shown: Float[np.ndarray, "rows columns"], steady: Bool[np.ndarray, "rows columns"]) -> float:
-    """The share of the picture in the largest piece where a photo lacks what nearly all others show."""
+def _hidden_share(
+    view: CommonView, photo: int, shown: Float[np.ndarray, "rows columns"], steady: Bool[np.ndarray, "rows columns"]
+) -> float:
+    """The share of the picture in the largest piece where a photo lacks what nearly all others show, highlights apart.
+
+    A glossy table's highlight washes texture out, too. It has no edge, and it is brighter than what lies around it.
+    """
     hidden = (shown < MISSING) & steady
-    pieces = cv2.connectedComponentsWithStats(hidden.astype(np.uint8), connectivity=4)[2]
-    return float(pieces[1:, cv2.CC_STAT_AREA].max(initial=0)) / hidden.size
+    count, pieces = cv2.connectedComponents(hidden.astype(np.uint8), connectivity=4)
+    own, brightness = view.in_cells(view.textures[photo] ** 2), view.in_cells(view.brightness[photo])
+    usual = float(np.median(view.in_cells(view.common(photo) ** 2)[steady])) if steady.any() else 0.0
+    largest = 0
+    for number in range(1, count):
+        piece = (pieces == number).astype(np.uint8)
+        near, around = (cv2.dilate(piece, np.ones((size, size), np.uint8)) > 0 for size in (3, 7))
+        has_edge = own[near].max() > EDGE_ENERGY * usual
+        rest = brightness[around & ~near]
+        is_brighter = len(rest) > 0 and brightness[piece > 0].mean() > HIGHLIGHT * float(np.median(rest))
+        if has_edge or not is_brighter:
+            largest = max(largest, int(piece.sum()))
+    return largest / hidden.size
 
 
 def _own_strength(view: CommonView, photo: int) -> float:
