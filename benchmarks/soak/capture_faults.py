@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from capture.checks.picture_motion import Rotation
 from capture.decode.exif import focal_in_pixels
 from capture.photos.photo import decode_srgb, encode_srgb, read_photo
 
@@ -138,9 +139,9 @@ def _moved(px: float, is_step: bool, who: Callable[..., tuple[int, ...]] = _one_
         shift = source.px(px)
         way, roll = rng.uniform(0, 2 * np.pi), rng.uniform(-1, 1) * ROLL * shift / (width / 2)
         focal = focal_in_pixels(read_photo(source.photos[0]).focal_35mm, width, height)
-        matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
-        angles = np.array([-np.sin(way) * shift / focal, np.cos(way) * shift / focal, roll])
-        turn = matrix @ cv2.Rodrigues(angles)[0] @ np.linalg.inv(matrix)
+        rotation = Rotation(focal, width, height)
+        angles = rotation.from_shift(shift * np.array([np.cos(way), np.sin(way)])) + np.array([0.0, 0.0, roll])
+        turn = rotation.homography(angles)
 
         def alter(place: int) -> Pixels:
             encoded = encode_srgb(source.pixels(case.chosen[place]))

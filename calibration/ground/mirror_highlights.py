@@ -50,7 +50,7 @@ class _Spot:
 def find_highlights(
     field: GroundField, shadows: GroundShadows, points: Float[np.ndarray, "height width 3"]
 ) -> MirrorHighlights:
-    """Return the spots of all photos: of each the brightest, unless the picture's border cuts it.
+    """Return the spots of all photos: of each the brightest, unless its middle is hidden or out of the picture.
 
     Args:
         points: of the ground in each pixel, world; nan where none is.

@@ -62,7 +62,7 @@ def check_and_register(
     for i, path in enumerate(stack.paths):
         motion = own.get(i, np.eye(3)) @ (np.eye(3) if to_board is None else np.linalg.inv(to_board))
         if path not in off | dropped and _shift_of(motion, stack) > NEAR_ENOUGH:
-            kept.append(_registered(stack, told.get(path), path, motion))
+            kept.append(_registered(stack, path, motion))
     findings = _in_order(stack, kept)
     register(stack, findings)
     return findings
@@ -108,7 +108,7 @@ def _is_motion(finding: Finding) -> bool:
     return finding.kind in (MOVED, BOARD_OFF)
 
 
-def _registered(stack: PhotoStack, before: Finding | None, path: Path, motion: Homography) -> Finding:
+def _registered(stack: PhotoStack, path: Path, motion: Homography) -> Finding:
     to_file = stack.full_width / stack.rgb.shape[2]
     length = to_file * _shift_of(motion, stack)
     limit = FARTHEST_PX * stack.full_width / REFERENCE_PX
