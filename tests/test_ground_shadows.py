@@ -113,3 +113,26 @@ def test_print_that_is_too_dark_to_show_shadows_stays_ground():
         residual[(np.abs(ROWS - 60) < 15) & (COLUMNS > 58) & (COLUMNS < 110) & ~square & ~figure] = -2.0
     found = find_shadows(field).object_mask
     assert found[figure].mean() > 0.9 and not found[square].any()
+
+
+def _inside_a_frame(step: float) -> np.ndarray:
+    """What is found of the inside of a frame whose right side is hard to see.
+
+    step: log units by which the inside is brighter or darker than the ground, in turns.
+    """
+    whole, inside = (np.abs(COLUMNS - 80) < 24) & (np.abs(ROWS - 60) < 16), np.zeros(ROWS.shape, bool)
+    inside[46:70, 62:102] = True
+    right, turns = whole & (COLUMNS > 101), np.array([-1, 1, -1, 1, -1, 1])[:, None]
+    field = _field(whole & ~inside & ~right)
+    field.residual[:, inside] += step * turns
+    field.residual[:, right] = 0.088 * turns  # log likelihood ratio -0.2: nearly ground
+    return find_shadows(field).object_mask[inside]
+
+
+def test_a_level_top_nearer_to_the_lights_is_lit_otherwise_than_the_ground():
+    """A chair's seat: nothing behind it is hidden from many lights, and its brightness changes with each light."""
+    assert _inside_a_frame(0.06).mean() > 0.95
+
+
+def test_what_a_frame_encloses_stays_ground_where_it_is_lit_as_the_ground_is():
+    assert _inside_a_frame(0.01).mean() < 0.05

@@ -105,6 +105,19 @@ def test_a_lost_light_is_found_again_among_many_places(ball):
     assert terms.costs(lost, k)(places[:1], 1.0)[0] == pytest.approx(every_ray, rel=1e-9)
 
 
+@pytest.mark.slow
+def test_a_light_is_found_again_from_the_other_side(ball):
+    """From half around, two thirds too near: no fine grid about that start reaches its place."""
+    camera, lights, maps = ball
+    every = np.ones(len(lights), bool)
+    terms = OutlineTerms(maps, EYE, camera.ground_height, every, every)
+    k = 4
+    lost = np.where(np.arange(len(lights))[:, None] == k, lights[k] * [-0.4, -0.4, 0.4], lights)
+    places = likely_places(terms, lost, k, np.stack([lost[k], lost[k] + 50]))
+    cosine = places[0] @ lights[k] / np.linalg.norm(places[0]) / np.linalg.norm(lights[k])
+    assert np.degrees(np.arccos(cosine)) < 4
+
+
 def test_a_penumbra_is_wider_the_higher_its_edge_and_the_lower_its_light(ball):
     """R h / (z - h) times distance / z on the ground (similar triangles), and (z - h) / z of that at the edge."""
     _, _, maps = ball

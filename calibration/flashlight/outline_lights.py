@@ -25,6 +25,8 @@ from calibration.flashlight.model import (
     PER_FLASHLIGHT,
     Evidence,
     Flashlights,
+    Samples,
+    cell_residuals,
     cost,
     free_tangent,
     normal_equations,
@@ -41,6 +43,7 @@ from calibration.outlines.relocate import likely_places
 from calibration.outlines.shadow_start import shadow_starts
 from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
 from calibration.posed_camera import PosedCamera
+from capture.checks.robust import spread
 from capture.photos.photo import PhotoStack
 
 OUTLINE_SIDE = 504  # px: grain and noise of larger pictures make outlines ragged, smaller ones make them coarse
@@ -48,7 +51,7 @@ THIN = 4  # every fourth ground cell: misfits are smooth over many
 LIT = 0.85  # visibility from which a cell's brightness counts
 UNUSUAL = 2.0  # sigmas of a distance from which a light is looked for again
 ROUNDS = 3  # in which lights are located among those that are known by then, at most
-TRIED = 3  # likely places of a stray light that are fitted to outlines and shading
+TRIED = 4  # likely places of a stray light that are fitted to outlines and shading
 FEWEST_WHOLE = 8  # photos whose shadows the picture does not cut
 OUTLINES_WRONG = 1 / 3  # of the trusted photos at odds: more than are ever bad, so the object's outline is wrong, ...
 REPAIRED = 0.5  # ... and its hull is right if it leaves less than this share of them at odds
@@ -222,7 +225,21 @@ def _alone(
 
     found, weight = refine(start, evidence, LOOSE, own, FAR[:4] + NEAR[-4:])
     vague = float(outlines.vagueness(k, found.positions[k : k + 1])[0])
-    return found, cost(found, evidence, weight, LOOSE) + vague
+    forgotten = _forgotten(fit, found, evidence, weight, k)
+    return found, cost(found, evidence, weight, LOOSE) + forgotten + vague
+
+
+def _forgotten(fit: FlashlightFit, found: Flashlights, evidence: Evidence, weight: Samples, k: int) -> float:
+    """Return what the samples of photo k cost that its fit forgot: without it the place that forgets most is the best.
+
+    With the weights of Tukey's biweight, half the weighted sum of squares plus this is its function rho.
+    """
+    ground = fit.weight.sum(0) > 0
+    cut = NEAR[-1].cut * spread(fit.residual()[(fit.evidence.weight > 0) & ground])
+    size = cell_residuals(found, evidence, weight)[k]
+    left = np.maximum(1 - (size / cut) ** 2, 0.0)
+    rho = cut**2 / 6 * (1 - left**3)
+    return float(((evidence.weight[k] * rho - 0.5 * weight[k] * size**2) * ground).sum())
 
 
 def _refitted(fit: FlashlightFit, flashlights: Flashlights, trusted: Bool[np.ndarray, " photos"]) -> FlashlightFit:

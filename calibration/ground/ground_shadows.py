@@ -4,10 +4,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import binary_fill_holes, find_objects, label
 
 from calibration.ground.ground_field import GroundField, Maps
+from capture.checks.robust import spread
 
 DARK = -0.8  # log units: ground below is in shadow
 USUAL_DARK = -1.8  # log level of a shadow where a photo shows none
@@ -29,6 +30,8 @@ NEIGHBOURS = np.ones((3, 3), np.uint8)  # of a pixel, and itself
 RIM = np.ones((7, 7), np.uint8)  # around a hole: where the ground beside it is looked at, two pixels wide
 FRONT = 0.25  # of a top's rim, seen from above: its near edge is a third or more
 RIM_PHOTOS = 2  # photos that show the ground behind a top in shadow, at least
+RING, RING_GAP = 31, 5  # px: the ground around a hole, and between that and what is unlike ground
+OTHER_LIGHT = 0.045  # log units over the photos: shadow loops, arches: up to .03; a chair's seat, boxes: .06 to .1
 
 
 @dataclass(frozen=True)
@@ -53,31 +56,33 @@ def find_shadows(field: GroundField) -> GroundShadows:
         seam = _seam(field.beyond)
         mask = _largest(_across(likelihood, seam), field)
         likelihood = np.where(field.beyond | seam, np.float32(ODDS), likelihood)
-    tops = level_tops(likelihood, mask, (field.usable & (field.residual < DARK)).sum(0))
+    tops = _level_tops(field, likelihood, mask)
     likelihood = np.where(tops, np.float32(ODDS), likelihood)
     return GroundShadows(visibility.astype(np.float32), dark, likelihood, mask | tops)
 
 
-def level_tops(
-    likelihood: Float[np.ndarray, "height width"],
-    mask: Bool[np.ndarray, "height width"],
-    dark: Int[np.ndarray, "height width"],
+def _level_tops(
+    field: GroundField, likelihood: Float[np.ndarray, "height width"], mask: Bool[np.ndarray, "height width"]
 ) -> Bool[np.ndarray, "height width"]:
     """Return the object's level tops: they are lit as the ground is, but the object and its shadows enclose them.
 
     A top is a hole in what is unlike the ground, or in that together with the shadows of all photos, and no wider than
     the object. Shadows alone enclose ground, too, as those of a thick head on a thin neck that meet behind it, or what
     is too dark to show them, as print. A top has the object's side below it, towards the camera: FRONT of its rim, or
-    more. Behind it the ground is hidden from many lights: half of the rest of the rim is dark in RIM_PHOTOS photos.
+    more. Then either of these tells it:
+
+    - behind it the ground is hidden from many lights: half of the rest of its rim is dark in RIM_PHOTOS photos;
+    - it lies nearer to the lights than the ground does: its brightness, relative to that of the ground around, differs
+      from photo to photo (OTHER_LIGHT).
 
     Args:
         likelihood: mean log likelihood ratio, object over ground.
         mask: the object without these tops.
-        dark: how many photos show a pixel in shadow.
     """
     found = np.zeros(mask.shape, bool)
     if not mask.any():
         return found
+    dark = (field.usable & (field.residual < DARK)).sum(0)
     unlike, widest, holes = _closed(likelihood > GROUND_LIKE), _extent(mask), np.empty(mask.shape, np.int32)
     seen = _joined(mask, unlike)
     for whole in (seen, _joined(mask, _closed(unlike | (dark > 0)))):
@@ -85,15 +90,34 @@ def level_tops(
         for number, box in enumerate(find_objects(holes), 1):
             if max(side.stop - side.start for side in box) > widest:
                 continue
-            around = tuple(slice(max(side.start - len(RIM), 0), side.stop + len(RIM)) for side in box)
+            around = tuple(slice(max(side.start - RING, 0), side.stop + RING) for side in box)
             hole = (holes[around] == number).astype(np.uint8)
             edge = cv2.dilate(hole, NEIGHBOURS) > 0
             rim = (cv2.dilate(hole, RIM) > 0) & ~edge
             behind = rim & ~unlike[around]
-            has_front = seen[around][rim].mean() > FRONT
-            if has_front and (not behind.any() or np.median(dark[around][behind]) >= RIM_PHOTOS):
+            if seen[around][rim].mean() <= FRONT:
+                continue
+            is_shaded = not behind.any() or np.median(dark[around][behind]) >= RIM_PHOTOS
+            if is_shaded or _lit_otherwise(field, around, hole, unlike[around]) > OTHER_LIGHT:
                 found[around] |= edge
     return found
+
+
+def _lit_otherwise(
+    field: GroundField,
+    window: tuple[slice, ...],
+    hole: UInt8[np.ndarray, "rows columns"],
+    unlike: Bool[np.ndarray, "rows columns"],
+) -> float:
+    """Return one sigma over the photos of a hole's log brightness less that of the ground around, both where lit."""
+    near = cv2.dilate(((hole > 0) | unlike).astype(np.uint8), np.ones((RING_GAP, RING_GAP), np.uint8)) > 0
+    ring, steps = (cv2.dilate(hole, np.ones((RING, RING), np.uint8)) > 0) & ~near, []
+    for residual, usable in zip(field.residual[:, *window], field.usable[:, *window], strict=True):
+        lit = usable & (residual > DARK / 2)
+        inside, outside = residual[lit & (hole > 0)], residual[lit & ring]
+        if min(inside.size, outside.size) >= FEWEST_DARK:
+            steps.append(np.median(inside) - np.median(outside))
+    return spread(np.array(steps) - np.median(steps)) if len(steps) >= FEWEST_PHOTOS else 0.0
 
 
 def _joined(
