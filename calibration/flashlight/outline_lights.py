@@ -25,7 +25,6 @@ from calibration.flashlight.model import (
     PER_FLASHLIGHT,
     Evidence,
     Flashlights,
-    Samples,
     cell_residuals,
     cost,
     free_tangent,
@@ -194,11 +193,12 @@ def _located(
     """Locate each stray light among those that are none."""
     terms, flashlights = fit.evidence.outlines, fit.flashlights
     assert terms is not None
+    cut = _cut(fit)
     for k in np.flatnonzero(strays).tolist():
         alone = ~strays | (np.arange(len(strays)) == k)
         places = flashlights.positions
         likely = likely_places(replace(terms, trusted=alone), places, k, np.stack([start[k], places[k]]))
-        tries = [_alone(fit, flashlights, k, one, alone) for one in (*likely[:TRIED], by_shading[k])]
+        tries = [_alone(fit, flashlights, k, one, alone, cut) for one in (*likely[:TRIED], by_shading[k])]
         flashlights = min(tries, key=itemgetter(1))[0]
     return flashlights
 
@@ -209,8 +209,13 @@ def _alone(
     k: int,
     place: Float[np.ndarray, "3"],
     trusted: Bool[np.ndarray, " photos"],
+    cut: float,
 ) -> tuple[Flashlights, float]:
-    """Fit light k from a place with all others held; return also the cost of everything, to compare its places by."""
+    """Fit light k from a place with all others held; return also the cost of everything, to compare its places by.
+
+    Half the weighted sum of squares counts nothing for samples that the fit forgot: the place that forgets most would
+    be the best. So light k's samples cost what the biweight's own function says; see _biweight.
+    """
     assert fit.evidence.outlines is not None
     outlines = replace(fit.evidence.outlines, trusted=trusted)
     evidence = replace(fit.evidence, weight=fit.evidence.weight * trusted[:, None], outlines=outlines)
@@ -225,21 +230,24 @@ def _alone(
 
     found, weight = refine(start, evidence, LOOSE, own, FAR[:4] + NEAR[-4:])
     vague = float(outlines.vagueness(k, found.positions[k : k + 1])[0])
-    forgotten = _forgotten(fit, found, evidence, weight, k)
+    ground, own_weight = fit.weight.sum(0) > 0, evidence.weight[k]
+    size = cell_residuals(found, evidence, weight)[k]
+    forgotten = float(((own_weight * _biweight(size, cut) - 0.5 * weight[k] * size**2) * ground).sum())
     return found, cost(found, evidence, weight, LOOSE) + forgotten + vague
 
 
-def _forgotten(fit: FlashlightFit, found: Flashlights, evidence: Evidence, weight: Samples, k: int) -> float:
-    """Return what the samples of photo k cost that its fit forgot: without it the place that forgets most is the best.
+def _cut(fit: FlashlightFit) -> float:
+    """Return from which residual on (log units) the last fit forgets a sample."""
+    known = (fit.evidence.weight > 0) & (fit.weight.sum(0) > 0)
+    return NEAR[-1].cut * max(spread(fit.residual()[known]), NEAR[-1].narrowest)
 
-    With the weights of Tukey's biweight, half the weighted sum of squares plus this is its function rho.
+
+def _biweight(size: Float[np.ndarray, " n"], cut: float) -> Float[np.ndarray, " n"]:
+    """Return c^2 / 6 (1 - (1 - min(r / c, 1)^2)^3): about r^2 / 2 for small residuals r, constant from c on.
+
+    Beaton and Tukey, Technometrics 16 (1974): its derivative over r is the weight with which samples are fitted.
     """
-    ground = fit.weight.sum(0) > 0
-    cut = NEAR[-1].cut * spread(fit.residual()[(fit.evidence.weight > 0) & ground])
-    size = cell_residuals(found, evidence, weight)[k]
-    left = np.maximum(1 - (size / cut) ** 2, 0.0)
-    rho = cut**2 / 6 * (1 - left**3)
-    return float(((evidence.weight[k] * rho - 0.5 * weight[k] * size**2) * ground).sum())
+    return cut**2 / 6 * (1 - np.maximum(1 - (size / cut) ** 2, 0.0) ** 3)
 
 
 def _refitted(fit: FlashlightFit, flashlights: Flashlights, trusted: Bool[np.ndarray, " photos"]) -> FlashlightFit:

@@ -110,11 +110,12 @@ def _lit_otherwise(
     unlike: Bool[np.ndarray, "rows columns"],
 ) -> float:
     """Return one sigma over the photos of a hole's log brightness less that of the ground around, both where lit."""
-    near = cv2.dilate(((hole > 0) | unlike).astype(np.uint8), np.ones((RING_GAP, RING_GAP), np.uint8)) > 0
+    within = hole > 0
+    near = cv2.dilate((within | unlike).astype(np.uint8), np.ones((RING_GAP, RING_GAP), np.uint8)) > 0
     ring, steps = (cv2.dilate(hole, np.ones((RING, RING), np.uint8)) > 0) & ~near, []
     for residual, usable in zip(field.residual[:, *window], field.usable[:, *window], strict=True):
         lit = usable & (residual > DARK / 2)
-        inside, outside = residual[lit & (hole > 0)], residual[lit & ring]
+        inside, outside = residual[lit & within], residual[lit & ring]
         if min(inside.size, outside.size) >= FEWEST_DARK:
             steps.append(np.median(inside) - np.median(outside))
     return spread(np.array(steps) - np.median(steps)) if len(steps) >= FEWEST_PHOTOS else 0.0

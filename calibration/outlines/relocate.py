@@ -28,13 +28,13 @@ def likely_places(
     foot = terms.maps.foot
     cost_at = terms.costs(lights, k)
     found = []
-    for step, steps in (NEAR_BY, ALL_AROUND):
-        grid = _around(starts[0] - foot, 1.0, steps, step) + foot
+    for turning, steps in (NEAR_BY, ALL_AROUND):
+        grid = _around(starts[0] - foot, 1.0, steps, turning) + foot
         cost = cost_at(grid.reshape(-1, 3), BLURS[0]).reshape(grid.shape[:3])
         lowest = np.argwhere(cost == minimum_filter(cost, 3))
         lowest = lowest[np.argsort(cost[tuple(lowest.T)])][:MINIMA]
-        found += [*grid[tuple(lowest.T)]]
-    found += [*starts[1:]]
+        found.extend(grid[tuple(lowest.T)])
+    found.extend(starts[1:])
     costs = np.zeros(len(found))
     for level, blur in enumerate(BLURS[1:], 1):
         for number, place in enumerate(found):
