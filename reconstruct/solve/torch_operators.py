@@ -139,17 +139,22 @@ class TorchOperators:
         partial = _bounded(self.sdf.sample(silhouette), weight[edge])
         share = torch.zeros_like(weight).index_put((edge,), area_ratio(partial, self.width * self.part_t[pixel[edge]]))
         start, is_away = self._starts(pixel, share, self._lights(photo)[0], label)
-        far = self._marched(start, photo, jitter[:, 0], s)
-        near = self._marched(silhouette, photo[edge], jitter[edge, 1], s)
-        lost_far, lost_near = far.log_transmittance(s, True), near.log_transmittance(s, True)
+        # The far ray of each pixel, then the near ones: marched together, they cost a device one march.
+        starts, photos = torch.cat([start, silhouette]), torch.cat([photo, photo[edge]])
+        lights, sizes = self._lights(photos)
+        first = torch.cat([jitter[:, 0], jitter[edge, 1]])
+        both = march(self.sdf, starts, lights, s, first, light_sizes=sizes)
+        parts = [len(start), len(silhouette)]
+        lost_far, lost_near = both.log_transmittance(s, True).split(parts)
+        clear_far, clear_near = self._clear_loss(both, torch.cat([label, label[edge]])).split(parts)
         # A surface that faces away from its light is dark by itself, max(n . l, 0): see kernels.shadow_pass.
         seen = (1 - share) * torch.where(is_away, 0.0, lost_far.exp())
         absorbed = (1 - share) * torch.where(is_away, 1.0, -lost_far.expm1())
         seen = seen.index_add(0, edge, share[edge] * lost_near.exp())
         absorbed = absorbed.index_add(0, edge, share[edge] * -lost_near.expm1())
         loss = cross_entropy(seen, absorbed, label) / s
-        loss = loss + torch.where(~is_away & (1 - share > LEAST_SHARE), self._clear_loss(far, label), 0.0)
-        of_near = torch.where(share[edge] > LEAST_SHARE, self._clear_loss(near, label[edge]), 0.0)
+        loss = loss + torch.where(~is_away & (1 - share > LEAST_SHARE), clear_far, 0.0)
+        of_near = torch.where(share[edge] > LEAST_SHARE, clear_near, 0.0)
         (weight * loss.index_add(0, edge, of_near)).sum().backward()
         return (seen.detach() - label).abs()
 
@@ -176,12 +181,6 @@ class TorchOperators:
             moved = moved_intersection(start[free], view[free], change, normals[free], GRAZING)
             start = start.index_put((free,), moved)
         return start, is_hit & (label < 0.5) & away
-
-    def _marched(
-        self, start: Float[Tensor, "n 3"], photo: Int[Tensor, " n"], jitter: Float[Tensor, " n"], s: float
-    ) -> LightRays:
-        lights, sizes = self._lights(photo)
-        return march(self.sdf, start, lights, s, jitter, light_sizes=sizes)
 
     def _lights(self, photo: Int[Tensor, " n"]) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
         """Return the light of each ray, and the tensor that collects the magnitude of the light's gradient."""

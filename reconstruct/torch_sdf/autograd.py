@@ -62,8 +62,9 @@ class Sample(torch.autograd.Function):
         amount = slope.to(ctx.real)
         if ctx.quantum:
             amount = amount.clamp(-LARGEST, LARGEST)
-        nodes = volume.spread(points, amount, ctx.quantum) if of_values else None
-        sizes = volume.spread(points, amount.abs(), ctx.quantum) if of_evidence else None
+        index, shares = volume.shares(points, amount, ctx.quantum)
+        nodes = volume.summed(index, shares) if of_values else None
+        sizes = volume.summed(index, shares.abs()) if of_evidence else None
         pull = volume.gradient(points) * slope[:, None] if of_points else None
         return nodes, sizes, pull, slope.abs() if of_sizes else None, None, None
 

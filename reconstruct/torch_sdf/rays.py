@@ -7,7 +7,6 @@ All quantities are in the grid frame, as in the kernels: nodes have integer coor
 voxels. Tensors of one call share a device and a floating type: float32 suffices for positions accurate to 1e-4 voxel.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -15,13 +14,13 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from reconstruct.sdf.kernels import DARK, MAX_MINIMA, REFRACTORY, STEP
+from reconstruct.sdf.kernels import DARK, MAX_MINIMA, REFRACTORY
+from reconstruct.torch_sdf.march import State, Stride, forget_blocks, marched
 from reconstruct.torch_sdf.volume import Volume
 
 MISSED = 1e9  # the parameter of a ray that meets nothing
 MOST_RAYS = 2**17  # at once; on 240 nodes 1.2 GiB for camera rays, 0.4 GiB for shadow rays
 FEWEST_RAYS = 2**11  # at once: where these do not fit into memory, the grid hardly does
-BLOCK = 8  # steps between two checks of which rays have ended: each check waits for the device
 PARALLEL = 1e-9  # direction component below which a ray never meets the faces of that axis
 ROOT_STEPS, ROOT_ACCURACY = 4, 1e-3  # regula falsi, the last step a bisection; voxels
 
@@ -37,6 +36,7 @@ class Batches:
         if self.rays <= FEWEST_RAYS:
             return False
         self.rays //= 2
+        forget_blocks()
         return True
 
 
@@ -103,12 +103,8 @@ def extrema(
     crossing = (near < end).nonzero()[:, 0]
     o, d, near, end = origins[crossing], directions[crossing], near[crossing], end[crossing]
     band = 5.0 / sharpness + 1.0
-
-    def stride(t: Tensor, f: Tensor) -> Tensor:
-        return (0.95 * (f.abs() - band)).clamp(min=STEP)
-
-    first = jitter[crossing] if isinstance(jitter, Tensor) else jitter
-    times, values = _recorded(volume, (o, d), near, end, stride, first)
+    first = jitter[crossing] if isinstance(jitter, Tensor) else torch.full_like(near, jitter)
+    times, values = _recorded(volume, (o, d), near, end, Stride(near.new_full((), band)), first)
     found = _extrema_of(volume, (o, d), end, sharpness, times, values)
     full = []
     for part, blank in zip(found, (0, 0, 0, 0, 0, 0, 0, MISSED), strict=True):
@@ -141,52 +137,24 @@ def first_surface(
     crossing = (near < end).nonzero()[:, 0]
     rays = (origins[crossing], directions[crossing])
     near, end = near[crossing], end[crossing]
-
-    def stride(t: Tensor, f: Tensor) -> Tensor:
-        size, half = f.abs(), 0.5 * width * t
-        return torch.where(size < 2.0 + half, STEP, (0.95 * (size - 1.0 - half)).clamp(min=STEP))
-
-    times, values = _recorded(volume, rays, near, end, stride)
+    stride = Stride(near.new_ones(()), near.new_full((), 0.5 * width))
+    times, values = _recorded(volume, rays, near, end, stride, torch.ones_like(near))
     hit, part_t, part_f = torch.full_like(far, MISSED), torch.full_like(far, -1.0), torch.zeros_like(far)
     hit[crossing], part_t[crossing], part_f[crossing] = _surface_of(volume, rays, width, times, values)
     return hit, part_t, part_f
 
 
 def _recorded(
-    volume: Volume,
-    rays: tuple[Tensor, Tensor],
-    near: Tensor,
-    end: Tensor,
-    stride: Callable[[Tensor, Tensor], Tensor],
-    first: Tensor | float | None = None,
+    volume: Volume, rays: tuple[Tensor, Tensor], near: Tensor, end: Tensor, stride: Stride, factor: Tensor
 ) -> tuple[Float[Tensor, "samples n"], Float[Tensor, "samples n"]]:
     """Return parameter and SDF of every sample from near to end; after a ray's end its last sample is repeated.
 
     Args:
-        stride: returns the step to the next sample, given a ray's parameter and the SDF there.
-        first: factor of the first step.
+        factor: of the first step.
     """
-    o, d = rays
-    t, f = near, volume.sample(o + near[:, None] * d)
-    times, values = [t[None]], [f[None]]
-    alive = torch.arange(len(near), device=near.device)
-    while len(alive):
-        block = []
-        for _ in range(BLOCK):
-            step = stride(t, f)
-            t = torch.minimum(t + (step if first is None else first * step), end)
-            f = volume.sample(torch.addcmul(o, t[:, None], d))
-            first = None
-            block.append((t, f))
-        for rows, new in zip((times, values), zip(*block, strict=True), strict=True):
-            whole = rows[-1][-1].expand(BLOCK, -1).clone()
-            whole[:, alive] = torch.stack(new)
-            rows.append(whole)
-        goes_on = (t < end).nonzero()[:, 0]
-        alive, o, d, t, f, end = (x[goes_on] for x in (alive, o, d, t, f, end))
-    times.append(times[-1][-1:])
-    values.append(values[-1][-1:])
-    return torch.cat(times), torch.cat(values)
+    first = volume.sample(rays[0] + near[:, None] * rays[1])
+    times, values = marched(volume, State(*rays, end, near, first, factor), stride)
+    return torch.cat([times, times[-1:]]), torch.cat([values, values[-1:]])
 
 
 def _refined(

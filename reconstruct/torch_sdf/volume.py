@@ -55,19 +55,21 @@ class Volume:
         weight = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
         return first[:, None] + self.offsets, weight.reshape(-1, 8)
 
-    def spread(
+    def shares(
         self, points: Float[Tensor, "n 3"], amounts: Float[Tensor, " n"], quantum: float = 0.0
-    ) -> Float[Tensor, "nx ny nz"]:
-        """Distribute amounts at points to the nodes by trilinear weights and sum them: the adjoint of sampling.
+    ) -> tuple[Int[Tensor, "n 8"], Float[Tensor, "n 8"]]:
+        """Return the eight nodes around each point as flat indices, and their trilinear shares of its amount.
 
         Args:
             quantum: shares are rounded to multiples of it, unless 0.
         """
         index, weight = self.corners(points)
         shares = weight.to(amounts.dtype) * amounts[:, None]
-        if quantum:
-            shares = (shares / quantum).round() * quantum
-        nodes = torch.zeros(self.phi.numel(), dtype=amounts.dtype, device=amounts.device)
+        return index, (shares / quantum).round() * quantum if quantum else shares
+
+    def summed(self, index: Int[Tensor, "n 8"], shares: Float[Tensor, "n 8"]) -> Float[Tensor, "nx ny nz"]:
+        """Return the sum of shares at each node: with `shares`, the adjoint of sampling."""
+        nodes = torch.zeros(self.phi.numel(), dtype=shares.dtype, device=shares.device)
         return nodes.index_add_(0, index.reshape(-1), shares.reshape(-1)).view(self.phi.shape)
 
 

@@ -1,0 +1,177 @@
+"""March rays by blocks of samples. On a CUDA device a block is recorded once and replayed in one go, as a CUDA graph.
+
+A recorded block is some 180 small operations, each of which takes a card longer to start than to compute. A replay runs
+the same operations on the same numbers: its results are those of the block run one by one, to the bit.
+"""
+
+import logging
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from reconstruct.sdf.kernels import STEP
+from reconstruct.torch_sdf.volume import Volume
+
+BLOCK = 8  # samples between two checks of which rays have ended: each check waits for the device
+RECORDED = 2 * BLOCK  # samples of a recorded block, whose rays all go on to the end of the last one
+FEWEST = 2**10  # rays of a recorded block; its number of rays is a power of two
+KEPT = 12  # recorded blocks: their memory is theirs
+LOG = logging.getLogger(__name__)
+
+
+class Stride(NamedTuple):
+    """How far a ray goes from a sample, voxels; numbers on its device.
+
+    By 0.95 (|SDF| - margin), at least STEP. With a slope, the margin grows by slope * t, and where |SDF| is less than 1
+    above it, the ray goes by STEP.
+    """
+
+    margin: Float[Tensor, ""]
+    slope: Float[Tensor, ""] | None = None
+
+    def after(self, t: Float[Tensor, " n"], f: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+        """Return the step from parameter t, where the SDF is f."""
+        size = f.abs()
+        if self.slope is None:
+            return (0.95 * (size - self.margin)).clamp(min=STEP)
+        half = self.slope * t
+        step = (0.95 * (size - self.margin - half)).clamp(min=STEP)
+        return torch.where(size < self.margin + 1 + half, STEP, step)
+
+
+class State(NamedTuple):
+    """Rays under way."""
+
+    origins: Float[Tensor, "n 3"]
+    directions: Float[Tensor, "n 3"]
+    end: Float[Tensor, " n"]
+    t: Float[Tensor, " n"]  # of the last sample
+    f: Float[Tensor, " n"]
+    factor: Float[Tensor, " n"]  # of the next step
+
+    def block(
+        self, volume: Volume, stride: Stride, samples: int
+    ) -> tuple[Float[Tensor, "samples n"], Float[Tensor, "samples n"]]:
+        """Return parameter and SDF of the next samples; at a ray's end its last one is repeated."""
+        t, f, times, values = self.t, self.f, [], []
+        for number in range(samples):
+            step = stride.after(t, f)
+            t = torch.minimum(t + (self.factor * step if number == 0 else step), self.end)
+            f = volume.sample(torch.addcmul(self.origins, t[:, None], self.directions))
+            times.append(t)
+            values.append(f)
+        return torch.stack(times), torch.stack(values)
+
+
+def marched(
+    volume: Volume, rays: State, stride: Stride
+) -> tuple[Float[Tensor, "samples n"], Float[Tensor, "samples n"]]:
+    """Return parameter and SDF of every sample after the first; after a ray's end its last sample is repeated."""
+    recorded = _recorded_block(volume, stride, len(rays.t))
+    rows = _one_by_one(volume, rays, stride) if recorded is None else recorded.march(volume, rays, stride)
+    times, values = zip(*rows, strict=True)
+    return torch.cat(times), torch.cat(values)
+
+
+def _one_by_one(volume: Volume, rays: State, stride: Stride) -> list[tuple[Tensor, Tensor]]:
+    alive, rows = torch.arange(len(rays.t), device=rays.t.device), [(rays.t[None], rays.f[None])]
+    while len(alive):
+        block = rays.block(volume, stride, BLOCK)
+        whole = tuple(row[-1].expand(BLOCK, -1).clone() for row in rows[-1])
+        for all_rays, some in zip(whole, block, strict=True):
+            all_rays[:, alive] = some
+        rows.append((whole[0], whole[1]))
+        t, f = block[0][-1], block[1][-1]
+        goes_on = (t < rays.end).nonzero()[:, 0]
+        alive = alive[goes_on]
+        rays = State(
+            *(x[goes_on] for x in (rays.origins, rays.directions, rays.end, t, f)), torch.ones_like(t[goes_on])
+        )
+    return rows
+
+
+class RecordedBlock:
+    """A block of one number of rays, of volumes of one shape, in memory of its own."""
+
+    def __init__(self, volume: Volume, stride: Stride, count: int):
+        """Make the memory of a block of `count` rays; until `record`, it runs operation by operation."""
+        self.volume = replace(volume, phi=volume.phi.clone())
+        self.stride = Stride(*(None if x is None else x.clone() for x in stride))
+        empty = volume.phi.new_zeros
+        self.rays = State(empty(count, 3), empty(count, 3), empty(count), empty(count), empty(count), empty(count))
+        self.replay = self._run
+
+    def record(self) -> None:
+        """Record the block as a CUDA graph.
+
+        Raises:
+            RuntimeError: the device records nothing.
+        """
+        device = self.rays.t.device
+        graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream(device)
+        stream.wait_stream(torch.cuda.current_stream(device))
+        with torch.cuda.stream(stream):
+            self._run()  # what only a first run sets up must not be recorded
+            graph.capture_begin(capture_error_mode="thread_local")
+            try:
+                self._run()
+            finally:
+                graph.capture_end()
+        torch.cuda.current_stream(device).wait_stream(stream)
+        self.replay = graph.replay
+
+    def _run(self) -> None:
+        self.times, self.values = self.rays.block(self.volume, self.stride, RECORDED)
+        self.rays.t.copy_(self.times[-1])
+        self.rays.f.copy_(self.values[-1])
+        self.rays.factor.fill_(1.0)
+        self.goes_on = (self.rays.t < self.rays.end).any()
+
+    def march(self, volume: Volume, rays: State, stride: Stride) -> list[tuple[Tensor, Tensor]]:
+        """Return what `marched` does, by blocks."""
+        count, rows = len(rays.t), [(rays.t[None], rays.f[None])]
+        self.volume.phi.copy_(volume.phi)
+        for mine, given in zip((*self.stride, *self.rays), (*stride, *rays), strict=True):
+            if mine is not None and given is not None:
+                mine[: len(given)].copy_(given) if given.dim() else mine.copy_(given)
+        self.rays.end[count:] = self.rays.t[count:] = 0.0
+        goes_on = True
+        while goes_on:
+            self.replay()
+            rows.append((self.times[:, :count].clone(), self.values[:, :count].clone()))
+            goes_on = bool(self.goes_on)
+        return rows
+
+
+_blocks: dict[tuple, RecordedBlock | None] = {}  # of this process, which uses one device; None: nothing can be recorded
+
+
+def _recorded_block(volume: Volume, stride: Stride, count: int) -> RecordedBlock | None:
+    """Return the block for so many rays on a CUDA device; None elsewhere, and where none can be recorded."""
+    if not volume.phi.is_cuda or not count:
+        return None
+    size = max(FEWEST, 1 << (count - 1).bit_length())
+    key = (volume.phi.shape, volume.phi.dtype, stride.slope is None, size)
+    if key in _blocks:
+        _blocks[key] = _blocks.pop(key)  # now the one used last
+        return _blocks[key]
+    while len(_blocks) >= KEPT:
+        del _blocks[next(iter(_blocks))]
+    try:
+        block = RecordedBlock(volume, stride, size)
+        block.record()
+        _blocks[key] = block
+    except torch.OutOfMemoryError:
+        raise
+    except RuntimeError as error:
+        LOG.info("no CUDA graph on this card (%s): operations are started one by one", error)
+        _blocks[key] = None
+    return _blocks[key]
+
+
+def forget_blocks() -> None:
+    """Give the memory of all recorded blocks back."""
+    _blocks.clear()
