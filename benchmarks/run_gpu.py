@@ -49,6 +49,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--input", default="rgb", choices=["rgb", "shadow"], help="photos, or shadow pictures and mask")
     parser.add_argument("--nodes", type=int, nargs="*", default=[], help="grids to time; else those of the preset")
     parser.add_argument("--no-cpu-solve", action="store_true", help="leave out the whole solve by the kernels")
+    parser.add_argument("--no-solve", action="store_true", help="leave out all whole solves")
     parser.set_defaults(table=Path("gpu.md"))
     return parser.parse_args()
 
@@ -143,6 +144,8 @@ def main() -> None:
     head += ["kernels, s per iteration", "torch, s per iteration", "ratio", "GPU memory, MiB"]
     parts = [table(head, [compare_level(scene, device, config, nodes) for nodes in grids])]
     sheet.write(*parts)
+    if options.no_solve:
+        return
     solves = [solve(subject, scene, config, device)]
     solves += [] if options.no_cpu_solve else [solve(subject, scene, config, None)]
     again = solve(subject, scene, config, device)[1]
