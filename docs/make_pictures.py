@@ -1,12 +1,15 @@
-"""Make the pictures of the README, docs/pictures/NAME.jpg, from the finished runs of the examples.
+"""Make the pictures of the README and the manual, docs/pictures/NAME.jpg, from finished runs.
 
-python docs/make_pictures.py runs/spot runs/cow
+    python docs/make_pictures.py runs/spot runs/cow
+    python docs/make_pictures.py --together phones runs/spot_charuco runs/hard_table
 
 Of one view: a photo, the mesh from two sides, depth and normals. Of several views and lies: a photo of each, and the
-mesh from all sides.
+mesh from all sides. Together: a row for each run, which ends with the view relit from a place where no lamp was.
 """
 
+import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +19,8 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from calibration.calibrated_views import load_views
 from calibration.calibration import Calibration
+from capture.photos.photo import encode_srgb
+from shadowgraph import RunResult, look, relight
 from viewer.display.pictures import depth_picture, mesh_picture, normal_picture
 
 HEIGHT = 300  # px of every panel
@@ -30,6 +35,7 @@ SIDES_DEG = (
 )  # azimuth, elevation
 BRIGHT = 235  # of 255
 MARGIN_SHARE = 0.35  # of the object's size around it
+TURN = np.radians(130.0)  # of the lamp about the vertical, from a photo's to that of the relit view
 
 
 def on_white(picture: np.ndarray, height: int = HEIGHT) -> Image.Image:
@@ -74,6 +80,23 @@ def panels(run: Path) -> list[list[Image.Image]]:
     return [[photo_panel(run, "", places[0][1], HEIGHT), *shape, *(on_white(one[box]) for one in maps)]]
 
 
+def relit_panel(run: Path) -> Image.Image:
+    """The view of a run under the lamp of the photo that photo_panel shows, turned about the vertical."""
+    result = RunResult(run)
+    used = [light for light in result.calibration.lights if light.used]
+    light = used[len(used) // 3]
+    assert light.position is not None
+    middle = result.mesh.bounds.mean(0)
+    turn = np.array([[np.cos(TURN), -np.sin(TURN), 0], [np.sin(TURN), np.cos(TURN), 0], [0, 0, 1]])
+    away = turn @ (light.position - middle)
+    axis = None if light.axis is None else -away / np.linalg.norm(away)
+    lamp = replace(light, position=middle + away, axis=axis)
+    mask = np.asarray(Image.open(run / "mask.png")) > 127
+    view = look(result.fields, mask.shape[1])
+    linear = relight(view, lamp, result.calibration.beam, result.calibration.ambient).numpy()
+    return on_white(brightened(encode_srgb(linear))[crop_box(mask)])
+
+
 def photo_panel(run: Path, view: str, calibration: Calibration, height: int, aspect: float = 0.0) -> Image.Image:
     """A photo of a view, its part around the object."""
     has_folder = (run / view / "mask.png").is_file()
@@ -102,20 +125,31 @@ def row_of(parts: list[Image.Image], width: int) -> Image.Image:
     return sheet
 
 
+def save(rows: list[list[Image.Image]], name: str) -> None:
+    """Put rows of pictures below each other, evenly spread, into docs/pictures/NAME.jpg."""
+    width = max(sum(part.width for part in row) for row in rows)
+    strips = [row_of(row, width) for row in rows]
+    sheet = Image.new("RGB", (width, sum(strip.height for strip in strips)), "white")
+    top = 0
+    for strip in strips:
+        sheet.paste(strip, (0, top))
+        top += strip.height
+    target = Path(__file__).parent / "pictures" / f"{name}.jpg"
+    target.parent.mkdir(exist_ok=True)
+    sheet.save(target, quality=88)
+
+
 def main() -> None:
-    """Put the panels of each run side by side."""
-    for run in map(Path, sys.argv[1:]):
-        rows = panels(run)
-        width = max(sum(part.width for part in row) for row in rows)
-        strips = [row_of(row, width) for row in rows]
-        sheet = Image.new("RGB", (width, sum(strip.height for strip in strips)), "white")
-        top = 0
-        for strip in strips:
-            sheet.paste(strip, (0, top))
-            top += strip.height
-        target = Path(__file__).parent / "pictures" / f"{run.name}.jpg"
-        target.parent.mkdir(exist_ok=True)
-        sheet.save(target, quality=88)
+    """Make a picture of each run, or one of all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", type=Path)
+    parser.add_argument("--together", metavar="NAME", help="one picture of this name, a row for each run of one view")
+    options = parser.parse_args()
+    if options.together:
+        save([[*panels(run)[0], relit_panel(run)] for run in options.runs], options.together)
+        return
+    for run in options.runs:
+        save(panels(run), run.name)
 
 
 if __name__ == "__main__":

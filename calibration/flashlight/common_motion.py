@@ -1,6 +1,7 @@
 """All lights from outlines and shading together: the search from rough starts, and the motion that outlines leave free,
 which the shading of all photos decides."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,15 +32,15 @@ FREE_AIMS = (0.3,) * len(BLURS)  # of the scale: how far beams may miss the comm
 NARROW_AIMS = (0.1, 0.12, 0.15, 0.2, 0.25, 0.3)  # ... and in a pass that begins with all beams aimed alike
 FOLLOWED = 2  # starts, the best of one pass, that are followed by further ones
 PASSES = 3  # of these, at most, ...
-LOST = 1e9  # the posterior of lights that no ground follows
+LOST = 1e9  # the cost of lights that no ground follows
 GAIN = 2.0  # ... while each gains more than this of the negative log posterior
 SMALL = (-0.1, 0.0, 0.1)  # homologies, of the median 1 / z
 MORE_SCANS = 4  # at most, where the best start is the first or the last of its scan
 SCATTER = 4.0  # of the negative log posterior between joint fits from near starts: it has many small minima
-ALIKE = 40.0  # ground cells that are wrong together: a misfit is smooth over some 60 mm
+ALIKE = 80.0  # ground cells that are wrong together: within a photo 14 to 24 by their correlation, and photos err alike
 CONTRASTS = (0.7, 0.8, 0.9, 1.0, 1.1)  # of log brightness in the picture over that in the scene, that are tried
 CONTRAST_WIDTH = 0.1  # prior sigma of its logarithm about 0: phones lift whole regions that are dark
-_Found = tuple[float, FlashlightFit, float]  # negative log posterior, fit, misfit of its shading (log units)
+_Found = tuple[float, FlashlightFit, float]  # cost of its outlines, fit, misfit of its shading (log units)
 LOOSE = Priors(log_power=0.1, beam=50.0, power_outlier=0.5)  # a hot centre, rings; a phone's tone differs by photo
 
 
@@ -57,10 +58,11 @@ def searched(starts: list[Float[np.ndarray, "photos 3"]], evidence: Evidence) ->
         evidence: with outlines; photos that these do not trust stay about where the starts put them.
     """
     assert evidence.outlines is not None
+    trusted = _trusted(evidence, USUAL_MISFIT)
     first = [_pass(one, evidence, USUAL_MISFIT, None, FREE_AIMS) for one in starts]
-    order = np.argsort([one[0] for one in first])[:FOLLOWED]
+    order = np.argsort(_posteriors(first, trusted))[:FOLLOWED]
     found = [_followed(first[number], evidence) for number in order]
-    posterior = np.array([one[0] for one in found])
+    posterior = _posteriors(found, trusted)
     best = int(posterior.argmin())
     fit = found[best][1]
     places = np.stack([one[1].flashlights.positions for one in found])
@@ -71,14 +73,16 @@ def searched(starts: list[Float[np.ndarray, "photos 3"]], evidence: Evidence) ->
 
 def _followed(found: _Found, evidence: Evidence) -> _Found:
     """Return the best of further passes of the search."""
+    trusted = _trusted(evidence, USUAL_MISFIT)
     for _ in range(PASSES):
         further = _again(found, evidence, FREE_AIMS)
-        gain = found[0] - further[0]
-        found = further if gain > 0 else found
-        if gain < GAIN:
+        before, after = _posteriors([found, further], trusted)
+        found = further if after < before else found
+        if before - after < GAIN:
             break
     alike = _again(found, evidence, NARROW_AIMS)
-    return min((found, alike, _again(alike, evidence, FREE_AIMS)), key=lambda one: one[0])
+    tried = [found, alike, _again(alike, evidence, FREE_AIMS)]
+    return tried[int(_posteriors(tried, trusted).argmin())]
 
 
 def _again(found: _Found, evidence: Evidence, aims: tuple[float, ...]) -> _Found:
@@ -122,15 +126,16 @@ def best_common_motion(
         like: a state with aims, powers and beam to begin with.
     """
     assert evidence.outlines is not None
-    posterior, fit, goes_on = _scan(lights, evidence, sizes, like)
+    found, goes_on = _scan(lights, evidence, sizes, like)
     for _ in range(MORE_SCANS):
         if not goes_on:
             break
-        further, trial, goes_on = _scan(fit.flashlights.positions, evidence, SMALL, fit.flashlights)
-        if further >= posterior:
+        further, goes_on = _scan(found[1].flashlights.positions, evidence, SMALL, found[1].flashlights)
+        before, after = _posteriors([found, further], evidence)
+        if after >= before:
             break
-        posterior, fit = further, trial
-    return fit
+        found = further
+    return found[1]
 
 
 def at_best_contrast(start: Flashlights, evidence: Evidence, contrasts: tuple[float, ...] = CONTRASTS) -> FlashlightFit:
@@ -147,17 +152,15 @@ def at_best_contrast(start: Flashlights, evidence: Evidence, contrasts: tuple[fl
         contrasts: that are tried; 1 alone where the photos are linear.
     """
     assert evidence.outlines is not None
-    found = [_joint(start.positions, _flattened(evidence, one), USUAL_MISFIT, LOOSE, start)[1:] for one in contrasts]
-    shown = np.array([one * misfit for one, (_, misfit) in zip(contrasts, found, strict=True)])  # in the pictures
-    cells = _independent_cells(_weighted(evidence, USUAL_MISFIT).weight, float(np.median(shown)))
+    found = [_joint(start.positions, _flattened(evidence, one), USUAL_MISFIT, LOOSE, start) for one in contrasts]
+    shown = [(cost, fit, one * misfit) for one, (cost, fit, misfit) in zip(contrasts, found, strict=True)]
     surprise = np.log(contrasts) / CONTRAST_WIDTH
-    outlines = [evidence.outlines.cost(fit.flashlights.positions) for fit, _ in found]
-    cost = np.array(outlines) + cells * np.log(shown) + 0.5 * surprise**2
+    cost = _posteriors(shown, evidence) + 0.5 * surprise**2  # of the misfit in the pictures
     weight = np.exp(cost.min() - cost)
     best = float(weight @ contrasts / weight.sum())
-    near = found[int(np.abs(np.array(contrasts) - best).argmin())][0].flashlights
+    near = found[int(np.abs(np.array(contrasts) - best).argmin())][1].flashlights
     fit = best_common_motion(near.positions, _flattened(evidence, best), SMALL, near)
-    places = np.stack([one.flashlights.positions for one, _ in found])
+    places = np.stack([one.flashlights.positions for _, one, _ in found])
     middle = np.einsum("f,fkx->kx", weight / weight.sum(), places)
     return _as_pictured(replace(fit, between=fit.between + variance_about(middle, places, weight)), evidence)
 
@@ -174,35 +177,36 @@ def _as_pictured(fit: FlashlightFit, evidence: Evidence) -> FlashlightFit:
     return replace(fit, flashlights=flashlights, weight=weight, evidence=_weighted(evidence, misfit))
 
 
-def _posterior(flashlights: Flashlights, terms: OutlineTerms, weight: Samples, misfit: float) -> float:
-    """Return the negative log posterior of a state whose shading misfits by so much (log units)."""
-    return float(terms.cost(flashlights.positions) + _independent_cells(weight, misfit) * np.log(misfit))
+def _posteriors(found: Sequence[_Found], evidence: Evidence) -> Float[np.ndarray, " found"]:
+    """Return the negative log posteriors of fits to the same evidence, up to a constant that they share.
 
-
-def _independent_cells(weight: Samples, misfit: float) -> float:
-    """Return as how many cells the shading counts: a misfit beyond noise is the model's, and cells share it."""
-    return float((weight > 0).sum() / ALIKE * min(1.0, NOISE / misfit) ** 2)
+    The shading counts as cells whose errors are independent, -log of each by log(misfit). A misfit beyond noise is the
+    model's, and cells share it: of all fits, the one that explains the shading best tells how many are left.
+    """
+    misfit = np.array([one[2] for one in found])
+    cells = (evidence.weight > 0).sum() / ALIKE * min(1.0, NOISE / float(misfit.min())) ** 2
+    return np.array([one[0] for one in found]) + cells * np.log(misfit)
 
 
 def _scan(
     lights: Float[np.ndarray, "photos 3"], evidence: Evidence, sizes: tuple[float, ...], like: Flashlights
-) -> tuple[float, FlashlightFit, bool]:
-    """Fit from each start and from their mean; return the mean's negative log posterior, its fit, and whether the best
-    start was the first or the last, so that a better one may lie beyond."""
+) -> tuple[_Found, bool]:
+    """Fit from each start and from their mean; return the mean's fit, and whether the best start was the first or the
+    last, so that a better one may lie beyond."""
     terms = evidence.outlines
     assert terms is not None
     found = [_joint(same_shadows(lights, size, terms), evidence, USUAL_MISFIT, LOOSE, like) for size in sizes]
-    cost = np.array([one[0] for one in found])
+    cost = _posteriors(found, evidence)
     weight = np.exp((cost.min() - cost) / SCATTER)
     mean = float((weight * sizes).sum() / weight.sum())
     best = int(cost.argmin())
     misfit = found[best][2]
     nearest = min(sizes, key=lambda size: abs(size - mean))
     near = found[sizes.index(nearest)][1].flashlights
-    posterior, fit, _ = _joint(same_shadows(near.positions, mean - nearest, terms), evidence, misfit, LOOSE, near)
+    middle = _joint(same_shadows(near.positions, mean - nearest, terms), evidence, misfit, LOOSE, near)
     places = np.stack([one[1].flashlights.positions for one in found])
-    fit = replace(fit, between=variance_about(fit.flashlights.positions, places, weight))
-    return posterior, fit, best in (0, len(sizes) - 1)
+    fit = replace(middle[1], between=variance_about(middle[1].flashlights.positions, places, weight))
+    return (middle[0], fit, middle[2]), best in (0, len(sizes) - 1)
 
 
 def variance_about(
@@ -230,7 +234,7 @@ def same_shadows(
 def _joint(
     places: Float[np.ndarray, "photos 3"], evidence: Evidence, misfit: float, priors: Priors, like: Flashlights
 ) -> _Found:
-    """Fit from given places near the answer; return the negative log posterior, the fit and the shading's misfit.
+    """Fit from given places near the answer; return the cost of outlines, the fit and the shading's misfit.
 
     Shading alone places the photos whose outlines are not trusted.
     """
@@ -244,9 +248,8 @@ def _settled(start: Flashlights, evidence: Evidence, weighted: Evidence, priors:
     assert terms is not None
     flashlights, weight = refine(start, weighted, priors, free_tangent, FAR[:8] + NEAR)
     misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
-    posterior = _posterior(flashlights, terms, weighted.weight, misfit)
     return (
-        posterior if (weight > 0).any() else LOST,
+        terms.cost(flashlights.positions) if (weight > 0).any() else LOST,
         FlashlightFit(flashlights, _weighted(evidence, misfit), weight, priors, free_tangent),
         misfit,
     )

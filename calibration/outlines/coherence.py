@@ -100,16 +100,18 @@ class OneLight:
 
     Rays of photos from the side are left out: places are compared, and the tripod's rays say the same of them.
 
-    Args: as for residuals; photo: the light that is moved; it takes part.
+    Args: as for residuals; photo: the light that is moved; it takes part; every: only every so many-th ray is asked.
     """
 
-    def __init__(self, maps, lights, eye, used, photo: int):
+    def __init__(self, maps, lights, eye, used, photo: int, every: int = 1):
         from calibration.outlines.coherence_kernels import proven_by_others
 
         self._maps, self._photo = maps, photo
+        asked = np.arange(len(maps.owner)) % every == 0
+        self._mine = asked & (maps.owner == photo)
         self._views, self._used = np.concatenate([lights, eye[None]]), np.append(used, True).astype(np.uint8)
         self._soft = np.append(softness(maps, lights), 0.0)
-        others = self._used.astype(bool)[maps.owner] & (maps.owner != photo)
+        others = asked & self._used.astype(bool)[maps.owner] & (maps.owner != photo)
         self._starts, self._owner = maps.starts[others], maps.owner[others]
         self._worst = np.empty((len(self._starts), HEIGHTS))
         others_used = self._used.copy()
@@ -126,7 +128,7 @@ class OneLight:
         found = np.empty((len(places), len(self._starts)))
         where = (maps.corner, maps.cell, heights, self._soft, self._worst, places, own_soft, found)
         least_with_places(self._starts, self._owner, self._views, maps.fields[photo], *where)
-        mine = maps.owner == photo
+        mine = self._mine
         own, views, soft = np.empty((len(places), mine.sum())), self._views.copy(), self._soft.copy()
         height, by, first_step = np.empty(mine.sum()), np.empty(mine.sum(), np.int64), maps.first_step[mine]
         for number, place in enumerate(places):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -82,17 +83,24 @@ class OutlineTerms:
     ) -> Callable[[Float[np.ndarray, "places 3"], float], Float[np.ndarray, " places"]]:
         """Return the function that gives the cost with light k, which counts as trusted, at each of many places.
 
-        Its second argument is the factor of an outline's sigma. What the other lights prove is computed once.
+        Its second argument is the factor of an outline's sigma: of wider outlines fewer rays are asked, since
+        neighbours say the same. What the other lights prove is computed once.
         """
         lift = np.array([0.0, 0.0, self.ground])
         lights, used = np.ones((len(self.used), 3)), self.used.copy()
         lights[self.used] = positions - lift
         used[self.used] = self.trusted | (np.arange(len(positions)) == k)
-        one = OneLight(self.maps, lights, self.eye - lift, used, int(np.flatnonzero(self.used)[k]))
+        photo = int(np.flatnonzero(self.used)[k])
+
+        @cache
+        def one_light(every: int) -> OneLight:
+            return OneLight(self.maps, lights, self.eye - lift, used, photo, every)
 
         def at(places: Float[np.ndarray, "places 3"], blur: float) -> Float[np.ndarray, " places"]:
-            size = np.maximum(one.emptiness(places - lift), 0) / (PIXEL_ERROR * self.maps.pixel * blur)
-            rays = np.log1p(size**2).sum(1) / (2 * SAME) + self.vagueness(k, places)
+            every = int(min(blur, SAME))
+            empty = one_light(every).emptiness(places - lift)
+            size = np.maximum(empty, 0) / (PIXEL_ERROR * self.maps.pixel * blur)
+            rays = every * np.log1p(size**2).sum(1) / (2 * SAME) + self.vagueness(k, places)
             trials = np.repeat(positions[None], len(places), 0)
             trials[:, k] = places
             return rays + np.array([self._other_cost(one) for one in trials])
