@@ -9,8 +9,8 @@ mesh from all sides. Together: a row for each run, which ends with the view reli
 
 import argparse
 import sys
-from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import trimesh
@@ -19,8 +19,9 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from calibration.calibrated_views import load_views
 from calibration.calibration import Calibration
-from capture.photos.photo import encode_srgb
-from shadowgraph import RunResult, look, relight
+from calibration.light import Light
+from reconstruct.export.relit import NewLight, write_relit
+from reconstruct.stored_run.stored_run import StoredRun
 from viewer.display.pictures import depth_picture, mesh_picture, normal_picture
 
 HEIGHT = 300  # px of every panel
@@ -81,28 +82,30 @@ def panels(run: Path) -> list[list[Image.Image]]:
 
 
 def relit_panel(run: Path) -> Image.Image:
-    """The view of a run under the lamp of the photo that photo_panel shows, turned about the vertical."""
-    result = RunResult(run)
-    used = [light for light in result.calibration.lights if light.used]
-    light = used[len(used) // 3]
+    """The view of a run under a lamp at the place of the photo that photo_panel shows, turned about the vertical."""
+    stored = StoredRun(run)
+    middle, light = stored.mesh.bounds.mean(0), shown_light(stored.calibration)
     assert light.position is not None
-    middle = result.mesh.bounds.mean(0)
     turn = np.array([[np.cos(TURN), -np.sin(TURN), 0], [np.sin(TURN), np.cos(TURN), 0], [0, 0, 1]])
-    away = turn @ (light.position - middle)
-    axis = None if light.axis is None else -away / np.linalg.norm(away)
-    lamp = replace(light, position=middle + away, axis=axis)
+    x, y, z = (middle + turn @ (light.position - middle)).tolist()
     mask = np.asarray(Image.open(run / "mask.png")) > 127
-    view = look(result.fields, mask.shape[1])
-    linear = relight(view, lamp, result.calibration.beam, result.calibration.ambient).numpy()
-    return on_white(brightened(encode_srgb(linear))[crop_box(mask)])
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "relit.png"
+        write_relit(stored, file, NewLight(light=(x, y, z)), mask.shape[1], lambda *_: None)
+        return on_white(brightened(np.asarray(Image.open(file)))[crop_box(mask)])
+
+
+def shown_light(calibration: Calibration) -> Light:
+    """The light whose photo is shown."""
+    used = [light for light in calibration.lights if light.used]
+    return used[len(used) // 3]
 
 
 def photo_panel(run: Path, view: str, calibration: Calibration, height: int, aspect: float = 0.0) -> Image.Image:
     """A photo of a view, its part around the object."""
     has_folder = (run / view / "mask.png").is_file()
     mask = np.asarray(Image.open(run / view / "mask.png" if has_folder else run / "mask.png")) > 127
-    used = [light.photo for light in calibration.lights if light.used]
-    name = f"{Path(used[len(used) // 3]).stem}.jpg"
+    name = f"{Path(shown_light(calibration).photo).stem}.jpg"
     beside = run / "thumbs" / f"{view.replace('/', '-')}-{name}"
     thumb = Image.open(beside if beside.is_file() else run / "thumbs" / name).resize(mask.shape[::-1])
     return on_white(brightened(np.asarray(thumb)[crop_box(mask, aspect)]), height)

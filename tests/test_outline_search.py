@@ -77,6 +77,19 @@ def test_the_search_follows_its_best_starts_and_says_how_far_likely_ones_lie_apa
     assert not told_doubt(replace(fit, between=0.0))
 
 
+@pytest.mark.slow
+def test_of_blurred_outlines_fewer_rays_are_asked_and_say_about_the_same(ball):
+    """The cost of all rays, with one light at places that are 10 to 30 % too far and turned."""
+    _, lights, maps = ball
+    every, k = np.ones(len(lights), bool), 4
+    terms = OutlineTerms(maps, EYE, 0.0, every, every)
+    turn = np.array([[np.cos(0.3), -np.sin(0.3), 0], [np.sin(0.3), np.cos(0.3), 0], [0, 0, 1]])
+    places = np.array([1.1 * lights[k], 1.3 * lights[k], turn @ lights[k], 1.2 * turn.T @ lights[k]])
+    fewer, all_rays = terms.costs(lights, k)(places, 6.0), replace(terms, blur=6.0)
+    moved = [all_rays.cost(np.where(np.arange(len(lights))[:, None] == k, one, lights)) for one in places]
+    np.testing.assert_allclose(fewer - terms.vagueness(k, places), moved, rtol=0.3)
+
+
 def test_fits_are_compared_by_the_same_number_of_cells(ball):
     """A tenth more of misfit is worth log(1.1) for each cell, and outlines weigh against it; up to a constant.
 

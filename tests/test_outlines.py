@@ -102,12 +102,7 @@ def test_a_lost_light_is_found_again_among_many_places(ball):
     assert np.degrees(np.arccos(cosine)) < 3
     assert np.linalg.norm(places[0]) == pytest.approx(np.linalg.norm(lights[k]), rel=0.2)
     every_ray = terms.cost(trials) + terms.vagueness(k, places[:1])[0]
-    cost_at = terms.costs(lost, k)
-    assert cost_at(places[:1], 1.0)[0] == pytest.approx(every_ray, rel=1e-9)
-    # Of blurred outlines fewer rays are asked, and say about the same.
-    fewer, all_rays = cost_at(places[:4], 6.0), replace(terms, blur=6.0)
-    moved = [all_rays.cost(np.where(np.arange(len(lights))[:, None] == k, one, lights)) for one in places[:4]]
-    np.testing.assert_allclose(fewer - terms.vagueness(k, places[:4]), moved, rtol=0.3)
+    assert terms.costs(lost, k)(places[:1], 1.0)[0] == pytest.approx(every_ray, rel=1e-9)
 
 
 @pytest.mark.slow
