@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 
 from reconstruct.run import presets
+from reconstruct.shading import joint_normals
 from reconstruct.source.options import LONG_SIDES
 
 SIDE = 240  # px
+STEPS = 20  # of 150, when few photos leave the normals of all pixels to be fitted together
 TESTS = Path(__file__).parent
 ENVIRONMENT = {"PYTHONPATH": f"{TESTS}{os.pathsep}{TESTS.parent}"}  # of a process with `brief_command`
 _RUN = """import sys, shadowgraph
@@ -28,10 +30,11 @@ def brief_command(*words: object) -> list[str]:
 
 @contextmanager
 def brief_drafts() -> Iterator[None]:
-    """The preset draft with smaller pictures, on coarser grids and with nearly half the iterations."""
+    """The preset draft with smaller pictures, on coarser grids and with fewer iterations of every kind."""
     first, last = presets.DRAFT_LEVELS
     levels = replace(first, nodes=32, iterations=20), replace(last, nodes=48, iterations=20)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(presets, "DRAFT_LEVELS", levels)
         patch.setitem(LONG_SIDES, "draft", SIDE)
+        patch.setattr(joint_normals, "STEPS", STEPS)
         yield

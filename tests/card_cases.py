@@ -23,9 +23,9 @@ from reconstruct.shadowneus.trainer import train
 from reconstruct.solve.solver import fit
 from reconstruct.torch_sdf.autograd import transmittance
 
-COARSE = FitConfig(levels=(Level(16, 3, (0.5, 0.4), 3, 5e-4), Level(24, 3, (0.4, 0.1), 2)), votes=1)
-MOVING = FitConfig(levels=(Level(16, 8, (0.5, 0.4), 3, 5e-4), Level(24, 8, (0.4, 0.1), 2)), votes=1)
-COLOUR = Look(width=40, height=30, n_lights=14)  # so many that each pixel has its own normal: fewer take minutes here
+COARSE = FitConfig(levels=(Level(16, 2, (0.5, 0.4), 3, 5e-4), Level(24, 2, (0.4, 0.1), 2)), votes=1)
+MOVING = FitConfig(levels=(Level(16, 5, (0.5, 0.4), 3, 5e-4), Level(24, 5, (0.4, 0.1), 2)), votes=1)
+COLOUR = Look(width=24, height=18, n_lights=14)  # so many that each pixel has its own normal: fewer take minutes here
 SHADOW = replace(COLOUR, with_shadow=True, with_mask=True)
 CPU = torch.device("cpu")
 if os.environ.get("CARD") == "cuda":
@@ -83,7 +83,7 @@ def test_a_solve_that_moves_lights_ends_as_on_the_cpu():
 @pytest.mark.parametrize("look", [COLOUR, SHADOW])
 @pytest.mark.parametrize("field", ["neural", "hash", "grid"])
 def test_a_training_ends_as_on_the_cpu(field, look):
-    scene, config = seen(look), replace(TINY, field=field)
+    scene, config = seen(look), replace(TINY, field=field, start_steps=2, iterations=3)
     end_alike(*(train(scene, config, lambda **_: None, None, place) for place in (CARD, CPU)))
 
 

@@ -19,6 +19,10 @@ from reconstruct.scene import Scene, build_scene
 SKIN = 1e-6  # mm along the normal: a shadow ray starts outside the surface it leaves
 
 
+def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return np.einsum("...j,...j", one, other)
+
+
 @dataclass(frozen=True)
 class Sphere:
     """A ball, mm."""
@@ -27,17 +31,23 @@ class Sphere:
     radius: float
     albedo: tuple[float, float, float] = (0.7, 0.6, 0.5)
 
-    def hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """First t > 0 along origins + t * directions (inf: none) and the outward normal there."""
+    def first(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """First t > 0 along origins + t * directions (inf: none)."""
         offset = origins - np.array(self.centre)
-        a = (directions**2).sum(-1)
-        b = (offset * directions).sum(-1)
-        root = b**2 - a * ((offset**2).sum(-1) - self.radius**2)
-        sqrt = np.sqrt(np.maximum(root, 0))
+        a, b = _dot(directions, directions), _dot(offset, directions)
+        root = b**2 - a * (_dot(offset, offset) - self.radius**2)
+        met = root >= 0
+        a, b, sqrt = a[met], b[met], np.sqrt(root[met])
         near, far = (-b - sqrt) / a, (-b + sqrt) / a
-        t = np.where(root < 0, np.inf, np.where(near > 0, near, np.where(far > 0, far, np.inf)))
+        t = np.full(len(root), np.inf)
+        t[met] = np.where(near > 0, near, np.where(far > 0, far, np.inf))
+        return t
+
+    def hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """That t, and the outward normal there."""
+        t = self.first(origins, directions)
         at = np.where(np.isfinite(t), t, 0.0)[:, None]
-        return t, (offset + at * directions) / self.radius
+        return t, (origins - np.array(self.centre) + at * directions) / self.radius
 
 
 @dataclass(frozen=True)
@@ -48,13 +58,18 @@ class Box:
     upper: tuple[float, float, float]
     albedo: tuple[float, float, float] = (0.5, 0.6, 0.7)
 
+    def first(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """First t > 0 along origins + t * directions (inf: none)."""
+        return self.hit(origins, directions)[0]
+
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """First t > 0 along origins + t * directions (inf: none) and the outward normal there."""
+        """That t, and the outward normal there."""
         safe = np.where(directions == 0, 1e-300, directions)
         a, b = (np.array(self.lower) - origins) / safe, (np.array(self.upper) - origins) / safe
-        entry, leave = np.minimum(a, b), np.maximum(a, b).min(-1)
-        face, near = entry.argmax(-1), entry.max(-1)
-        t = np.where((near <= leave) & (near > 0), near, np.inf)
+        entry, leave = np.minimum(a, b).T, np.maximum(a, b).T
+        near = np.maximum(np.maximum(entry[0], entry[1]), entry[2])  # by columns: numpy reduces short rows slowly
+        t = np.where((near <= np.minimum(np.minimum(leave[0], leave[1]), leave[2])) & (near > 0), near, np.inf)
+        face = np.where(entry[0] == near, 0, np.where(entry[1] == near, 1, 2))
         return t, -np.eye(3)[face] * np.sign(safe[np.arange(len(face)), face])[:, None]
 
 
@@ -218,7 +233,7 @@ def _is_blocked(shapes: tuple[Shape, ...], points: np.ndarray, light: Light) -> 
     place = light.homogeneous()
     towards = place[:3] - place[3] * points
     last = 1.0 if place[3] > 0 else np.inf  # of a point light: t = 1 is the light itself
-    return np.any([shape.hit(points, towards)[0] < last for shape in shapes], axis=0)
+    return np.any([shape.first(points, towards) < last for shape in shapes], axis=0)
 
 
 def _pattern(points: np.ndarray) -> np.ndarray:

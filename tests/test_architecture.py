@@ -28,10 +28,15 @@ def modules() -> dict[str, Path]:
 
 
 @cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
 def imports(path: Path) -> frozenset[str]:
     """Every name that a file imports, dotted, wherever in the file it does so."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.ImportFrom) and node.module:
             assert node.level == 0, f"{path}:{node.lineno} imports from a relative name"
             found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
@@ -43,7 +48,7 @@ def imports(path: Path) -> frozenset[str]:
 @cache
 def named(path: Path) -> frozenset[str]:
     """Every module that a string of a file names, alone or as "module:function"."""
-    texts = {n.value for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Constant)}
+    texts = {n.value for n in ast.walk(tree_of(path)) if isinstance(n, ast.Constant)}
     return frozenset(text.partition(":")[0] for text in texts if isinstance(text, str))
 
 
@@ -132,7 +137,7 @@ def reads_of(tree: ast.AST) -> list[str]:
 def test_files_of_a_run_are_opened_at_one_door():
     for name, path in modules().items():
         if not name.startswith(READERS):
-            found = reads_of(ast.parse(path.read_text()))
+            found = reads_of(tree_of(path))
             assert not found, f"{path} reads files itself ({found}); reconstruct/stored_run has a loader for each"
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import shadowgraph
 from calibration.calibration import load_calibration
 from capture.checks import first_look
 from capture.checks.first_look import FirstLook
@@ -68,11 +69,9 @@ def test_what_is_wrong_with_a_photo_is_named_at_once_and_only_new_photos_are_rea
     assert {path.name for path in decoded} == {f"IMG_020{k}.jpg" for k in (1, 2, 3, 4)}
 
 
-@pytest.mark.slow  # a fit of all photos as the truth: half a minute
+@pytest.mark.slow  # a fit of all photos as the truth
 def test_lights_of_single_photos_are_where_the_whole_calibration_puts_them(tmp_path):
-    from shadowgraph.api import run
-
-    run(SPOT, tmp_path / "run", quiet=True, preset="draft")
+    assert shadowgraph.main(["calibrate", str(SPOT), "--out", str(tmp_path / "run")]) == 0
     calibration = load_calibration(tmp_path / "run" / "calibration.json")
     folder = flat_capture(tmp_path / "spot", LIT[:5])
     coach = Coach(folder)

@@ -15,6 +15,7 @@ from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
+from reconstruct.shading import joint_normals
 from tests.synthetic import BALL, Box, Look, Sphere, render
 
 SLAB = Box((-45.0, -30.0, 0.0), (45.0, 30.0, 20.0))
@@ -99,6 +100,7 @@ def test_under_few_lights_the_start_that_the_shadows_contradict_is_left(monkeypa
 
     for name in ("on_front", "follow_normals"):
         monkeypatch.setattr(choose_start, name, floats if name == spoilt else lambda grid, *_: (grid, 0.0))
+    monkeypatch.setattr(joint_normals, "STEPS", 20)
     config = FitConfig(levels=(Level(32, 1, (0.5, 0.4), 4),))
     found = choose_start.HullStart((scene,), (Observer(scene),), config, lambda _: None).surface()
     low, high = torch.tensor([BALL.centre, BALL.centre]) + torch.tensor([[0.0] * 3, [0.0, 0.0, 1.6 * BALL.radius]])

@@ -93,7 +93,7 @@ def on_bt709(linear):
     return decode_srgb(encoded.astype(np.float32))
 
 
-@pytest.mark.slow  # 12 s: two fits; what is said of them is tested below
+@pytest.mark.slow  # two fits, one of which asks the shadows' outlines; what is said of them is tested below
 def test_files_on_another_curve_than_srgb_raise_doubt(monkeypatch):
     truth = flashlight_photos.photograph(flashlight_photos.Recipe(n_photos=10))
     stack = replace(truth.stack, rgb=on_bt709(truth.stack.rgb))

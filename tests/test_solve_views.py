@@ -23,6 +23,7 @@ from reconstruct.render.joined import join_views
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
+from reconstruct.shading import joint_normals
 from reconstruct.solve.backend import joint_passes, surface_on
 from reconstruct.solve.solver import fit
 
@@ -42,6 +43,14 @@ def seen_from(azimuth: float, n_lights: int = 8, seed: int = 0, shapes=SHAPES) -
     look = Look(width=64, height=48, n_lights=n_lights, seed=seed)
     scene, truth = render(shapes, look, turned(azimuth))
     return replace(scene, view=f"view_{azimuth:.0f}"), truth
+
+
+@pytest.fixture(scope="module", autouse=True)
+def brief_normals():
+    """Six photos a view leave normals to be fitted together, many times in a solve: a few steps of that will do."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(joint_normals, "STEPS", 20)
+        yield
 
 
 @pytest.fixture(scope="module")

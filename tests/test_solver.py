@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import fake_run
 import numpy as np
 import pytest
 import torch
@@ -99,10 +100,8 @@ def test_a_damaged_checkpoint_counts_as_none(tmp_path):
     assert load_state(file, "any") is None
 
 
-def test_fields_come_back_from_their_file(tmp_path):
-    scene, _ = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=8))
-    quick = replace(SMALL, levels=(Level(16, 2, (0.3, 0.3), 1),))
-    fields = fit(scene, quick, Listener())
+def test_fields_come_back_from_their_file(tmp_path, truth):
+    fields = fake_run.fields_of(truth)
     save_fields(fields, tmp_path / "fields.safetensors")
     back = load_fields(tmp_path / "fields.safetensors")
     torch.testing.assert_close(back.grid.values, fields.grid.values)

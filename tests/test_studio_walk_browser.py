@@ -1,9 +1,10 @@
 """The studio as a person uses it, with the mouse alone and with the keyboard alone: from photos to a relit result.
 
-Slow, for the draft is a real one. A picture of each step lies in the test's folder (`--basetemp`).
+The draft is a real one, but brief. A picture of each step lies in the test's folder (`--basetemp`).
 """
 
 import pytest
+from brief_drafts import ENVIRONMENT, brief_command
 from chromium import CHROMIUM, PATIENCE_MS, wait_until
 from small_example import small_example
 from studio_client import served
@@ -27,10 +28,11 @@ def finished_stage(tab):
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
-def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp_path, size):  # noqa: F811
+def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp_path, size, monkeypatch):  # noqa: F811
+    monkeypatch.setenv("PYTHONPATH", ENVIRONMENT["PYTHONPATH"])
     photos, steps = small_example(tmp_path / "spot", slice(None, None, 2), slice(None, None, 3)), iter(range(99))
     (photos / "session.toml").unlink()  # a person has none
-    with served(tmp_path / "studio") as (_, _, owner):
+    with served(tmp_path / "studio", tuple(brief_command())) as (_, _, owner):
         tab, bad = opened(browser, owner, size)
 
         def look(name: str) -> None:

@@ -5,6 +5,7 @@ import io
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
@@ -120,7 +121,7 @@ def mesh_picture(
     picture = np.zeros((width * height, 4), np.float32)
     for points, light in _surface_samples(pixels, colours, mesh.faces):
         _draw_nearest(points, light, width, height, depth, picture)
-    blocks = picture.reshape(size[1], OVERSAMPLING, size[0], OVERSAMPLING, 4).mean((1, 3))
+    blocks = cv2.resize(picture.reshape(height, width, 4), size, interpolation=cv2.INTER_AREA)  # means of whole blocks
     cover = blocks[..., 3:]
     linear = np.divide(blocks[..., :3], cover, out=np.zeros_like(blocks[..., :3]), where=cover > 0)
     return np.concatenate([encode_srgb(linear), np.round(255 * cover).astype(np.uint8)], -1)
