@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from synthetic import BALL, HEAP, Box, Look, Truth, render
+from synthetic import BALL, HEAP, Box, Look, Sphere, Truth, render
 
 from calibration.ground.contact_gaps import without_gaps
 from calibration.ground.ground_shadows import find_shadows
@@ -151,3 +151,15 @@ def test_where_both_ways_explain_the_table_the_powers_decide():
         assert wrong_labels(found, truth) < 0.02
     again = label_ground(unknown, by_field)
     assert torch.equal(again.mask, by_field.mask) and torch.equal(again.visibility, by_field.visibility)
+
+
+@pytest.mark.parametrize("off", [0, 0.12])
+def test_an_object_nearly_black_is_no_ground_in_shadow(off):
+    """The lights' model finds an albedo and a shadow for each of its pixels, whether or not the powers are known."""
+    ball = Sphere((0.0, -50.0, 20.0), 20.0, (0.02, 0.02, 0.02))
+    scene, truth = render((ball,), replace(LOOK, noise=0.01))
+    scene = before_a_wall(scene, off)
+    assert overlap(by_the_lights(scene).mask.numpy() > 0.5, truth.mask) < 0.5
+    found = label_ground(scene)
+    assert overlap(found.mask.numpy() > 0.5, truth.mask) > 0.95
+    assert (found.confidence.numpy() * truth.mask)[:, found.mask.numpy() > 0.5].max() < 0.05  # no shadows on it

@@ -4,18 +4,20 @@ Beams with a hot centre, and phones that change the brightness from place to pla
 reconstruct.labels.ground_test could call ground. The field of calibration.ground follows both.
 """
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.ndimage import label
+from scipy.ndimage import label, mean
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from calibration.ground.contact_gaps import LIKELY as GAP
 from calibration.ground.contact_gaps import BareGround, without_gaps
 from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
-from calibration.ground.ground_shadows import LIKELY, find_shadows
+from calibration.ground.ground_shadows import LIKELY, NEIGHBOURS, find_shadows
 from calibration.ground.table_edges import seen_beyond
 from reconstruct.labels.ground_test import (
     GAP_CONFIDENCE,
@@ -60,7 +62,7 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     """Classify pixels as object or ground, and label the shadows on it: by the lights' model, or by a field of light.
 
     The field is used where the model makes much less of the picture ground than the field does. Where both explain what
-    lies before the ground's end, the outline is the model's, see _without_gaps, and the photos' powers decide whose
+    lies before the ground's end, both tell the outline, see _common_outline, and the photos' powers decide whose
     light is right, see _powers_off. How quiet the fits are is no evidence: the field bends to what it is fitted to, and
     so do the model's gains.
 
@@ -88,10 +90,13 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     share = float((field.follows > FOLLOWS).mean())
     if by_model.explained < EXPLAINED:
         return _by_field(scene, field, _bare(field)) if share > tested.explained + GAINED else by_model
-    if share < EXPLAINED or _powers_off(scene, field, by_model) < POWERS_OFF:
+    if share < EXPLAINED:
         return by_model
     bare = _bare(field)
-    return _by_field(scene, field, bare, _without_gaps(scene, by_model, bare))
+    outline = _common_outline(scene, by_model, bare)
+    if _powers_off(scene, field, by_model) < POWERS_OFF:
+        return _with_outline(by_model, outline)
+    return _by_field(scene, field, bare, outline)
 
 
 def _bare(field: GroundField) -> BareGround:
@@ -123,16 +128,43 @@ def _without_object(field: GroundField, beyond: Bool[np.ndarray, "height width"]
     return torch.from_numpy(beyond & ~find_shadows(field).object_mask)
 
 
-def _without_gaps(scene: Scene, by_model: GroundTest, bare: BareGround) -> Outline:
-    """Return the outline of the lights' model, with the gaps at contacts cut out that the field shows.
+def _with_outline(by_model: GroundTest, outline: Outline) -> GroundTest:
+    mask, confidence = outline
+    known = by_model.confidence * ((mask > 0.5) == (by_model.mask > 0.5))  # no shadows of ground where only one saw it
+    return replace(by_model, mask=mask, mask_confidence=confidence, confidence=known)
 
-    The model tells the object's level tops from the ground by their height, which no field does. In a gap it misses the
-    light that the object sends there, while the field compares each sample with lit ground and with shadow.
+
+def _common_outline(scene: Scene, by_model: GroundTest, bare: BareGround) -> Outline:
+    """Return the outline that the lights' model and the field tell together.
+
+    The model tells the object's level tops from the ground by their height, which no field does. In a gap at a contact
+    it misses the light that the object sends there, while the field compares each sample with lit ground and with
+    shadow: gaps are the field's. An object much darker than the ground is ground in shadow to a model whose lights are
+    off, and highlights on the ground or on a wall are objects: the field's object is added, but for holes in it that
+    both call ground. A part of the model's that does not touch it stays only if the field sees no ground there either,
+    nor what lies behind the ground's end.
     """
     if scene.mask is not None:
         return by_model.mask, by_model.mask_confidence
-    gap = torch.from_numpy((bare.gap_likelihood > GAP) & ~bare.shadows.object_mask) & (by_model.mask > 0.5)
-    return torch.where(gap, 0.0, by_model.mask), torch.where(gap, GAP_CONFIDENCE, by_model.mask_confidence)
+    assert scene.rgb is not None
+    by_field = bare.shadows.object_mask
+    drawn = (by_model.mask > 0.5).numpy()
+    region = drawn & ((bare.gap_likelihood <= GAP) | by_field)
+    if by_field.any():
+        parts, count = label(region, NEIGHBOURS)
+        strange = (bare.shadows.likelihood > LIKELY) & (True if bare.field.beyond is None else ~bare.field.beyond)
+        touching = cv2.dilate(by_field.astype(np.uint8), NEIGHBOURS) > 0
+        kept = mean(strange, parts, np.arange(count + 1)) > 0.5
+        kept[np.unique(parts[touching])] = True
+        kept[0] = False
+        is_hole = (bare.shadows.likelihood <= LIKELY) & (by_model.mask_confidence > 0.5).numpy()
+        found = torch.from_numpy((by_field & ~is_hole) | kept[parts])
+        region = object_region(found, torch.ones_like(found)).numpy()
+    margin = torch.from_numpy(np.abs(bare.shadows.likelihood - LIKELY) / CLEAR).float().clamp(GAP_CONFIDENCE, 1.0)
+    added, removed = (torch.from_numpy(one) for one in (region & ~drawn, drawn & ~region))
+    mask = torch.where(added | removed, coverage_at_edges(scene.rgb, torch.from_numpy(region)), by_model.mask)
+    confidence = torch.where(added, margin, torch.where(removed, GAP_CONFIDENCE, by_model.mask_confidence))
+    return mask, confidence
 
 
 def _by_field(scene: Scene, field: GroundField, bare: BareGround, outline: Outline | None = None) -> GroundTest:
