@@ -151,10 +151,11 @@ def _common_outline(scene: Scene, by_model: GroundTest, bare: BareGround) -> Out
     drawn = (by_model.mask > 0.5).numpy()
     region = drawn & ((bare.gap_likelihood <= GAP) | by_field)
     if by_field.any():
-        parts, count = label(region, NEIGHBOURS)
+        parts = np.empty(region.shape, np.int32)
+        label(region, NEIGHBOURS, output=parts)
         strange = (bare.shadows.likelihood > LIKELY) & (True if bare.field.beyond is None else ~bare.field.beyond)
         touching = cv2.dilate(by_field.astype(np.uint8), NEIGHBOURS) > 0
-        kept = mean(strange, parts, np.arange(count + 1)) > 0.5
+        kept = np.asarray(mean(strange, parts, np.arange(parts.max() + 1))) > 0.5
         kept[np.unique(parts[touching])] = True
         kept[0] = False
         is_hole = (bare.shadows.likelihood <= LIKELY) & (by_model.mask_confidence > 0.5).numpy()
