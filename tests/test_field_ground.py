@@ -163,3 +163,5 @@ def test_an_object_nearly_black_is_no_ground_in_shadow(off):
     found = label_ground(scene)
     assert overlap(found.mask.numpy() > 0.5, truth.mask) > 0.95
     assert (found.confidence.numpy() * truth.mask)[:, found.mask.numpy() > 0.5].max() < 0.05  # no shadows on it
+    moved = label_ground(replace(scene, lights=scene.lights * torch.tensor([1.02, 1.02, 1.02, 1.0])), found)
+    assert torch.equal(moved.mask, found.mask)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from brief_drafts import NORMAL_STEPS
 from scipy.ndimage import binary_erosion
 
 from reconstruct.config import FitConfig, Level
@@ -100,7 +101,7 @@ def test_under_few_lights_the_start_that_the_shadows_contradict_is_left(monkeypa
 
     for name in ("on_front", "follow_normals"):
         monkeypatch.setattr(choose_start, name, floats if name == spoilt else lambda grid, *_: (grid, 0.0))
-    monkeypatch.setattr(joint_normals, "STEPS", 20)
+    monkeypatch.setattr(joint_normals, "STEPS", NORMAL_STEPS)
     config = FitConfig(levels=(Level(32, 1, (0.5, 0.4), 4),))
     found = choose_start.HullStart((scene,), (Observer(scene),), config, lambda _: None).surface()
     low, high = torch.tensor([BALL.centre, BALL.centre]) + torch.tensor([[0.0] * 3, [0.0, 0.0, 1.6 * BALL.radius]])

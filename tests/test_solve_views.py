@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from brief_drafts import NORMAL_STEPS
 from scipy.spatial import KDTree
 from synthetic import Look, Sphere, Truth, default_camera, render
 
@@ -49,7 +50,7 @@ def seen_from(azimuth: float, n_lights: int = 8, seed: int = 0, shapes=SHAPES) -
 def brief_normals():
     """Six photos a view leave normals to be fitted together, many times in a solve: a few steps of that will do."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(joint_normals, "STEPS", 20)
+        patch.setattr(joint_normals, "STEPS", NORMAL_STEPS)
         yield
 
 

@@ -4,8 +4,6 @@ Beams with a hot centre, and phones that change the brightness from place to pla
 reconstruct.labels.ground_test could call ground. The field of calibration.ground follows both.
 """
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import torch
@@ -30,7 +28,7 @@ from reconstruct.labels.ground_test import (
 )
 from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.multiple_lights import is_shared, split_on_ground
-from reconstruct.labels.outline import dilated, may_hold_shadow, object_region
+from reconstruct.labels.outline import Outline, dilated, may_hold_shadow, object_region
 from reconstruct.scene import Scene, grey_irradiance, ground_points
 from reconstruct.shading.noise import Noise
 
@@ -55,8 +53,6 @@ CLEAR = 0.3  # mean log likelihood ratio of a photo that decides for sure
 TOO_BRIGHT, MANY = 0.5, 3  # log units: a highlight; in so many photos, ground whose albedo is that of its shadow
 AMBIENT_SHARE = 0.7  # of the light in shadows on the ground: the rest comes from the lit ground and the object
 
-Outline = tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]  # the mask of GroundTest, its confidence
-
 
 def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     """Classify pixels as object or ground, and label the shadows on it: by the lights' model, or by a field of light.
@@ -72,12 +68,15 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     Raises:
         ValueError: the scene has no photos (scene.rgb is None).
     """
+    outline = None if before is None else Outline(before.mask, before.mask_confidence)
     if before is not None and before.field is not None:
-        return _by_field(scene, before.field, _bare(before.field), (before.mask, before.mask_confidence))
+        return _by_field(scene, before.field, without_gaps(before.field, find_shadows(before.field)), outline)
     if is_shared(scene):
         return test_ground(split_on_ground(scene))
-    tested = test_ground(scene, None if before is None else before.background)
-    if before is not None or scene.ground_depth is not None:
+    if before is not None:
+        return test_ground(scene, before.background, outline if before.keeps_outline else None)
+    tested = test_ground(scene)
+    if scene.ground_depth is not None:
         return tested
     assert scene.rgb is not None
     rgb, usable = scene.rgb.numpy(), scene.usable.numpy()
@@ -86,21 +85,21 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     if beyond is None and tested.explained >= EXPLAINED:
         return tested
     field = at_photo_size(fit_ground_field(rgb, usable, beyond), rgb, usable)
-    by_model = tested if beyond is None else test_ground(scene, _without_object(field, beyond))
+    shadows = find_shadows(field)
+    # Beyond the ground's end, too, light is smooth and shadows fall, but on no ground.
+    background = None if beyond is None else torch.from_numpy(beyond & ~shadows.object_mask)
+    by_model = tested if background is None else test_ground(scene, background)
     share = float((field.follows > FOLLOWS).mean())
     if by_model.explained < EXPLAINED:
-        return _by_field(scene, field, _bare(field)) if share > tested.explained + GAINED else by_model
+        has_more = share > tested.explained + GAINED
+        return _by_field(scene, field, without_gaps(field, shadows)) if has_more else by_model
     if share < EXPLAINED:
         return by_model
-    bare = _bare(field)
+    bare = without_gaps(field, shadows)
     outline = _common_outline(scene, by_model, bare)
     if _powers_off(scene, field, by_model) < POWERS_OFF:
-        return _with_outline(by_model, outline)
+        return test_ground(scene, background, outline)
     return _by_field(scene, field, bare, outline)
-
-
-def _bare(field: GroundField) -> BareGround:
-    return without_gaps(field, find_shadows(field))
 
 
 def _powers_off(scene: Scene, field: GroundField, tested: GroundTest) -> float:
@@ -123,17 +122,6 @@ def _powers_off(scene: Scene, field: GroundField, tested: GroundTest) -> float:
     return float((typical - typical.median()).square().mean().sqrt()) if len(typical) else 0.0
 
 
-def _without_object(field: GroundField, beyond: Bool[np.ndarray, "height width"]) -> Bool[Tensor, "height width"]:
-    """Return what is seen beyond the ground's end: there, too, light is smooth and shadows fall, but on no ground."""
-    return torch.from_numpy(beyond & ~find_shadows(field).object_mask)
-
-
-def _with_outline(by_model: GroundTest, outline: Outline) -> GroundTest:
-    mask, confidence = outline
-    known = by_model.confidence * ((mask > 0.5) == (by_model.mask > 0.5))  # no shadows of ground where only one saw it
-    return replace(by_model, mask=mask, mask_confidence=confidence, confidence=known)
-
-
 def _common_outline(scene: Scene, by_model: GroundTest, bare: BareGround) -> Outline:
     """Return the outline that the lights' model and the field tell together.
 
@@ -145,7 +133,7 @@ def _common_outline(scene: Scene, by_model: GroundTest, bare: BareGround) -> Out
     nor what lies behind the ground's end.
     """
     if scene.mask is not None:
-        return by_model.mask, by_model.mask_confidence
+        return Outline(by_model.mask, by_model.mask_confidence)
     assert scene.rgb is not None
     by_field = bare.shadows.object_mask
     drawn = (by_model.mask > 0.5).numpy()
@@ -161,11 +149,11 @@ def _common_outline(scene: Scene, by_model: GroundTest, bare: BareGround) -> Out
         is_hole = (bare.shadows.likelihood <= LIKELY) & (by_model.mask_confidence > 0.5).numpy()
         found = torch.from_numpy((by_field & ~is_hole) | kept[parts])
         region = object_region(found, torch.ones_like(found)).numpy()
-    margin = torch.from_numpy(np.abs(bare.shadows.likelihood - LIKELY) / CLEAR).float().clamp(GAP_CONFIDENCE, 1.0)
+    sure = _confidence(bare.shadows.likelihood - LIKELY)
     added, removed = (torch.from_numpy(one) for one in (region & ~drawn, drawn & ~region))
     mask = torch.where(added | removed, coverage_at_edges(scene.rgb, torch.from_numpy(region)), by_model.mask)
-    confidence = torch.where(added, margin, torch.where(removed, GAP_CONFIDENCE, by_model.mask_confidence))
-    return mask, confidence
+    confidence = torch.where(added, sure, torch.where(removed, GAP_CONFIDENCE, by_model.mask_confidence))
+    return Outline(mask, confidence)
 
 
 def _by_field(scene: Scene, field: GroundField, bare: BareGround, outline: Outline | None = None) -> GroundTest:
@@ -175,7 +163,8 @@ def _by_field(scene: Scene, field: GroundField, bare: BareGround, outline: Outli
         bare: what of the picture is ground in this field.
         outline: the object's, where it is known already.
     """
-    mask, mask_confidence = _mask(scene, bare) if outline is None else outline
+    outline = _mask(scene, bare) if outline is None else outline
+    mask = outline.mask
     region = mask.numpy() > 0.5
     points = ground_points(scene).double().numpy()
     visibility, confidence = _visibility(bare)
@@ -189,7 +178,7 @@ def _by_field(scene: Scene, field: GroundField, bare: BareGround, outline: Outli
     noise = Noise(NOISE_FLOOR, max(TONE_SHARE, field.noise()))
     return GroundTest(
         mask,
-        mask_confidence,
+        outline.confidence,
         visibility,
         confidence,
         _albedo(scene, bare.field, scale, lit),
@@ -203,13 +192,17 @@ def _by_field(scene: Scene, field: GroundField, bare: BareGround, outline: Outli
 def _mask(scene: Scene, bare: BareGround) -> Outline:
     """Return coverage and its confidence, which is low where the pixel may be ground in a gap as well as object."""
     if scene.mask is not None:
-        return scene.mask, torch.ones_like(scene.mask)
+        return Outline(scene.mask, torch.ones_like(scene.mask))
     assert scene.rgb is not None
     found = torch.from_numpy(bare.shadows.object_mask)
     region = object_region(found, torch.ones_like(found))
-    margin = np.where(found, np.abs(bare.gap_likelihood - GAP), np.abs(bare.shadows.likelihood - LIKELY))
-    confidence = torch.from_numpy(margin / CLEAR).float().clamp(GAP_CONFIDENCE, 1.0)
-    return coverage_at_edges(scene.rgb, region), torch.where(found == region, confidence, GAP_CONFIDENCE)
+    confidence = _confidence(np.where(found, bare.gap_likelihood - GAP, bare.shadows.likelihood - LIKELY))
+    return Outline(coverage_at_edges(scene.rgb, region), torch.where(found == region, confidence, GAP_CONFIDENCE))
+
+
+def _confidence(margin: Float[np.ndarray, "height width"]) -> Float[Tensor, "height width"]:
+    """Return how sure a pixel is by the margin of its mean log likelihood ratio."""
+    return torch.from_numpy(np.abs(margin) / CLEAR).float().clamp(GAP_CONFIDENCE, 1.0)
 
 
 def _visibility(

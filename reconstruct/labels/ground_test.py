@@ -11,6 +11,7 @@ from reconstruct.labels.hue import has_other_hue
 from reconstruct.labels.level_tops import find_level_tops
 from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.outline import (
+    Outline,
     bright_object,
     coarse_mean,
     dilated,
@@ -57,6 +58,7 @@ class GroundTest:
     explained: float = 1.0  # share of the pixels with light and ground to compare with that behave as ground
     field: GroundField | None = None  # of light, where it made the labels instead of the lights' model
     ambient: float = 0.0  # irradiance of everything but the light, as that field's shadows show it
+    keeps_outline: bool = False  # the outline was told to it, and stays as it is when the lights move
 
 
 @dataclass(frozen=True)
@@ -83,13 +85,16 @@ class _Behaviour:
     ever_lit: Bool[Tensor, "height width"]
 
 
-def test_ground(scene: Scene, background: Bool[Tensor, "height width"] | None = None) -> GroundTest:
+def test_ground(
+    scene: Scene, background: Bool[Tensor, "height width"] | None = None, outline: Outline | None = None
+) -> GroundTest:
     """Classify pixels as object or ground, and label the shadows on the ground.
 
     A ground pixel has two values: I_k = albedo * (irradiance_k + ambient) when lit, a small one in shadow. The albedo
     is the densest cluster of I_k / irradiance_k. A smooth gain per photo absorbs errors of its light model, so that a
     light that is off by a few per cent does not make the whole ground fail. Level tops of the object pass this test;
-    find_level_tops tells them from the ground. A given scene.mask is kept; `background` is known to show neither.
+    find_level_tops tells them from the ground. A given scene.mask is kept, and an `outline` that others found;
+    `background` is known to show neither.
 
     Raises:
         ValueError: the scene has no photos (scene.rgb is None).
@@ -100,7 +105,8 @@ def test_ground(scene: Scene, background: Bool[Tensor, "height width"] | None = 
     if background is not None:
         between, level = (torch.where(background, 0.0, image) for image in (behaves.between, behaves.level))
         behaves = replace(behaves, between=between, level=level)
-    mask, mask_confidence = _mask(scene, behaves)
+    found = _mask(scene, behaves) if outline is None else outline
+    mask, mask_confidence = found.mask, found.confidence
     ground = (mask < 0.5) & behaves.known & (behaves.between < NOT_GROUND) & (behaves.level > 0)
     visibility, confidence = _visibility(behaves, ground, noise)
     albedo = torch.where((ground & behaves.ever_lit)[..., None], behaves.albedo, torch.zeros(()))
@@ -110,7 +116,8 @@ def test_ground(scene: Scene, background: Bool[Tensor, "height width"] | None = 
     if scene.mask is None:  # missed parts of the object lie beside the mask; a false lit pixel there would carve them
         confidence *= torch.where(dilated(mask > 0.5, 2 * RIM + 1), RIM_SHARE, 1.0)
     strange = float(((behaves.between >= NOT_GROUND) & behaves.known).sum() / behaves.known.sum().clamp(min=1))
-    return GroundTest(mask, mask_confidence, visibility, confidence, albedo, gain, noise, background, 1 - strange)
+    labels = visibility, confidence, albedo, gain, noise, background, 1 - strange
+    return GroundTest(mask, mask_confidence, *labels, keeps_outline=outline is not None)
 
 
 def _behaviour(scene: Scene) -> tuple[_Behaviour, Float[Tensor, "photos height width"], Noise]:
@@ -281,10 +288,10 @@ def _gap(
     return (seen.sum(0) >= FEWEST_SAMPLES) & ~never_lit, gap
 
 
-def _mask(scene: Scene, pixels: _Behaviour) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+def _mask(scene: Scene, pixels: _Behaviour) -> Outline:
     """Return coverage and its confidence: 0 if unknown or doubtful, low in the gap at a contact, half if overruled."""
     if scene.mask is not None:
-        return scene.mask, torch.ones_like(scene.mask)
+        return Outline(scene.mask, torch.ones_like(scene.mask))
     assert scene.rgb is not None
     likely = (pixels.between >= NOT_GROUND) & pixels.known
     region = object_region(likely, pixels.known)
@@ -300,7 +307,8 @@ def _mask(scene: Scene, pixels: _Behaviour) -> tuple[Float[Tensor, "height width
     unsure = share.isfinite()
     region = torch.where(unsure, share > 0.5, region)
     confidence = torch.where(unsure, torch.minimum(confidence, (2 * share - 1).abs()), confidence)
-    return coverage_at_edges(scene.rgb, region), confidence * torch.where(region, 1.0, pixels.known & ~tops.doubtful)
+    confidence = confidence * torch.where(region, 1.0, pixels.known & ~tops.doubtful)
+    return Outline(coverage_at_edges(scene.rgb, region), confidence)
 
 
 def _share_of_object(
@@ -387,13 +395,5 @@ def no_ground(scene: Scene) -> GroundTest:
     assert scene.rgb is not None
     shape = scene.rgb.shape[:3]
     mask = scene.mask if scene.mask is not None else bright_object(scene.rgb)
-    nothing = torch.zeros(shape)
-    return GroundTest(
-        mask=mask,
-        mask_confidence=torch.ones(shape[1:]),
-        visibility=nothing,
-        confidence=nothing,
-        albedo=torch.zeros(*shape[1:], 3),
-        gain=torch.ones(shape),
-        noise=DEFAULT_NOISE,
-    )
+    nothing, albedo = torch.zeros(shape), torch.zeros(*shape[1:], 3)
+    return GroundTest(mask, torch.ones(shape[1:]), nothing, nothing, albedo, torch.ones(shape), DEFAULT_NOISE)
