@@ -21,7 +21,7 @@ import psutil
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
-VERSIONS = ("numpy", "torch", "numba", "opencv-contrib-python-headless")
+MODULES = ("numpy", "torch", "numba", "cv2")  # whose packages are named with their versions
 NUMBER = re.compile(r"-?\d[\d.e+-]*$")
 KIB_PER_GIB = 2**20  # the kernel counts a process's peak in KiB
 
@@ -29,7 +29,8 @@ KIB_PER_GIB = 2**20  # the kernel counts a process's peak in KiB
 def machine() -> list[str]:
     """What numbers are measured on and with, as a list in Markdown."""
     commit = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True)
-    versions = ", ".join(f"{name} {metadata.version(name)}" for name in VERSIONS)
+    packages = metadata.packages_distributions()
+    versions = ", ".join(f"{packages[name][0]} {metadata.version(packages[name][0])}" for name in MODULES)
     memory = psutil.virtual_memory().total / 2**30
     return [
         f"- {platform.machine()}, {os.cpu_count()} cores, {memory:.0f} GiB, {platform.system()}; "
