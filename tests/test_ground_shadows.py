@@ -136,3 +136,28 @@ def test_a_level_top_nearer_to_the_lights_is_lit_otherwise_than_the_ground():
 
 def test_what_a_frame_encloses_stays_ground_where_it_is_lit_as_the_ground_is():
     assert _inside_a_frame(0.01).mean() < 0.05
+
+
+def _two_boxes(step: float) -> tuple[np.ndarray, ...]:
+    """Two boxes, the upper one above the larger lower one: the sides of both, what lies between, and what is found.
+
+    step: log units by which what lies between is brighter or darker than the ground, in turns.
+    """
+    lower = (np.abs(COLUMNS - 80) < 30) & (np.abs(ROWS - 90) < 10)
+    upper = (np.abs(COLUMNS - 80) < 14) & (np.abs(ROWS - 50) < 14)
+    top = (np.abs(COLUMNS - 80) < 30) & (ROWS > 46) & (ROWS < 81) & ~upper
+    field = _field(lower | upper)
+    field.residual[:, top] += step * np.array([-1, 1, -1, 1, -1, 1])[:, None]
+    return lower, upper, top, find_shadows(field).object_mask
+
+
+def test_what_stands_on_a_level_top_belongs_to_the_object_and_the_top_too():
+    """The top parts the sides of two boxes, and no edge of it shows; it is nearer to the lights than the ground."""
+    lower, upper, top, found = _two_boxes(0.06)
+    assert found[lower].mean() > 0.95 and found[upper].mean() > 0.95 and found[top].mean() > 0.9
+    assert (found & ~lower & ~upper & ~top).sum() < 0.1 * top.sum()
+
+
+def test_a_thing_behind_the_object_with_ground_between_is_another():
+    lower, upper, top, found = _two_boxes(0.0)
+    assert found[lower].mean() > 0.95 and not found[upper].any() and found[top].mean() < 0.05

@@ -21,7 +21,7 @@ GROUND_LIKE = -0.3  # log likelihood ratio below which a pixel is ground
 LIKELY = -0.1  # mean log likelihood ratio of a photo from which a pixel belongs to the object
 FEWEST_PHOTOS = 3
 PLINTH_GAP = 0.02  # of the picture's long side: between a plinth's side and what stands on it
-LEAST_STRIP = 0.3  # of the object's extent: a shorter strip is not the side of a plinth
+LEAST_STRIP = 0.3  # of the object's extent: a shorter part is no side of a plinth, and no box on a box
 BENT = 1.5  # area of the convex hull of a plinth's side over its own; of a wall's foot: 1
 SEAM = 0.006  # of the picture's long side, to both sides of the line where the ground ends
 LINE_GAP = 5  # px: shorter gaps in a line across the picture are closed
@@ -98,27 +98,39 @@ def _level_tops(
             if seen[around][rim].mean() <= FRONT:
                 continue
             is_shaded = not behind.any() or np.median(dark[around][behind]) >= RIM_PHOTOS
-            if is_shaded or _lit_otherwise(field, around, hole, unlike[around]) > OTHER_LIGHT:
+            if is_shaded or _is_lit_otherwise(_steps(field, around, hole > 0, _ring(hole, unlike[around]))):
                 found[around] |= edge
     return found
 
 
-def _lit_otherwise(
+def _ring(
+    hole: UInt8[np.ndarray, "rows columns"], unlike: Bool[np.ndarray, "rows columns"]
+) -> Bool[np.ndarray, "rows columns"]:
+    """Return the ground around a hole."""
+    near = cv2.dilate(hole | unlike.astype(np.uint8), np.ones((RING_GAP, RING_GAP), np.uint8)) > 0
+    return (cv2.dilate(hole, np.ones((RING, RING), np.uint8)) > 0) & ~near
+
+
+def _steps(
     field: GroundField,
     window: tuple[slice, ...],
-    hole: UInt8[np.ndarray, "rows columns"],
-    unlike: Bool[np.ndarray, "rows columns"],
-) -> float:
-    """Return one sigma over the photos of a hole's log brightness less that of the ground around, both where lit."""
-    within = hole > 0
-    near = cv2.dilate((within | unlike).astype(np.uint8), np.ones((RING_GAP, RING_GAP), np.uint8)) > 0
-    ring, steps = (cv2.dilate(hole, np.ones((RING, RING), np.uint8)) > 0) & ~near, []
+    within: Bool[np.ndarray, "rows columns"],
+    ground: Bool[np.ndarray, "rows columns"],
+) -> Float[np.ndarray, "photos 2"]:
+    """Return the median residual of the lit ground and how much more it is within; NaN where a photo shows too few."""
+    found = []
     for residual, usable in zip(field.residual[:, *window], field.usable[:, *window], strict=True):
         lit = usable & (residual > DARK / 2)
-        inside, outside = residual[lit & within], residual[lit & ring]
-        if min(inside.size, outside.size) >= FEWEST_DARK:
-            steps.append(np.median(inside) - np.median(outside))
-    return spread(np.array(steps) - np.median(steps)) if len(steps) >= FEWEST_PHOTOS else 0.0
+        inside, outside = residual[lit & within], residual[lit & ground]
+        few = min(inside.size, outside.size) < FEWEST_DARK
+        found.append((np.nan,) * 2 if few else (np.median(outside), np.median(inside) - np.median(outside)))
+    return np.array(found)
+
+
+def _is_lit_otherwise(steps: Float[np.ndarray, "photos 2"]) -> bool:
+    """Tell whether what _steps compares with the ground does not follow its light, by one sigma over the photos."""
+    known = steps[np.isfinite(steps[:, 1]), 1]
+    return len(known) >= FEWEST_PHOTOS and spread(known - np.median(known)) > OTHER_LIGHT
 
 
 def _joined(
@@ -189,7 +201,8 @@ def _largest(likelihood: Float[np.ndarray, "height width"], field: GroundField) 
     if not sizes.any():
         return np.zeros(likely.shape, bool)
     chosen, free = parts == int(sizes.argmax()), sizes[parts] > 0
-    return _with_plinth(np.asarray(binary_fill_holes(chosen)), free & ~chosen)
+    whole = _with_plinth(np.asarray(binary_fill_holes(chosen)), free & ~chosen)
+    return _with_stacked(field, likelihood, whole, free & ~whole)
 
 
 def _with_plinth(
@@ -213,6 +226,71 @@ def _with_plinth(
             both = cv2.morphologyEx((found | hull).astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
             found |= (both & near) | hull
     return np.asarray(binary_fill_holes(found))
+
+
+def _with_stacked(
+    field: GroundField,
+    likelihood: Float[np.ndarray, "height width"],
+    mask: Bool[np.ndarray, "height width"],
+    others: Bool[np.ndarray, "height width"],
+) -> Bool[np.ndarray, "height width"]:
+    """Add the likely parts that a level top parts from the object, with that top: what stands on it, or bears it.
+
+    A box on a box: between the sides of both lies the lower one's top, which is lit as the ground is. What lies between
+    the object and another thing on the ground is ground, lit as that beside both; a top is nearer to the lights, see
+    _level_tops. Parts that are small beside the object are left out: they are often noise.
+
+    Args:
+        likelihood: mean log likelihood ratio, object over ground.
+        mask: the object without these parts.
+        others: the other likely parts.
+    """
+    no_ground = _closed(likelihood > GROUND_LIKE) | (False if field.beyond is None else field.beyond)
+    parts, found, picture = np.empty(mask.shape, np.int32), mask.copy(), (slice(None), slice(None))
+    label(others, output=parts)
+    widest = LEAST_STRIP * _extent(mask)
+    for number in np.flatnonzero(np.bincount(parts.ravel()) > widest):
+        part = parts == number
+        top = ((_under(part) & _over(found)) | (_under(found) & _over(part))) & ~no_ground & ~found
+        if number == 0 or _extent(part) < widest or not top.any() or _extent(top) > _extent(found):
+            continue
+        rows = cv2.dilate(top.astype(np.uint8), np.ones((RING, 1), np.uint8)).any(1, keepdims=True)
+        beside = _ring(convex_hull(found | part).astype(np.uint8), no_ground) & rows
+        if _is_lit_otherwise(steps := _steps(field, picture, top, beside)):
+            found = _with_whole_top(field, steps, found | part | top)
+    return np.asarray(binary_fill_holes(found))
+
+
+def _with_whole_top(
+    field: GroundField, steps: Float[np.ndarray, "photos 2"], found: Bool[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """Return the object with what hangs together with it, lies above, and is lit as a known part of a level top is.
+
+    Nothing beside the object or higher in the picture is taken in. Over the photos, a pixel shows all of that part's
+    steps in brightness where it is as high, and none on the ground.
+
+    Args:
+        steps: of that part, see _steps.
+    """
+    shown, whole = np.zeros_like(field.albedo), np.zeros_like(field.albedo)
+    for residual, usable, (ground, step) in zip(field.residual, field.usable, steps, strict=True):
+        if np.isfinite(step):
+            lit = usable & (residual > DARK / 2)
+            shown += np.where(lit, (residual - ground) * step, 0)
+            whole += lit * step**2
+    shown, whole = (cv2.GaussianBlur(one, (0, 0), 1.0) for one in (shown, whole))
+    within = _over(found) & _under(found).any(1, keepdims=True)
+    return _joined(found, (shown > whole / 2) & within)
+
+
+def _under(region: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """Return the region and all pixels below it in the picture."""
+    return np.logical_or.accumulate(region, 0)
+
+
+def _over(region: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """Return the region and all pixels above it in the picture."""
+    return np.logical_or.accumulate(region[::-1], 0)[::-1]
 
 
 def convex_hull(region: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
