@@ -97,6 +97,7 @@ def report_of(truth: Truth) -> dict:
     cost = {"seconds": 4.0, "cpu_seconds": 7.1, "peak_memory_bytes": 412_000_000}
     photos = [{"name": light.photo, "role": "lit", "used": True, "reason": ""} for light in truth.calibration.lights]
     photos[2] |= {"used": False, "reason": "over-exposed: 38 % of the ground is saturated, at most 5 %"}
+    photos.insert(0, {"name": "board.jpg", "role": "board", "used": True, "reason": ""})
     return {
         "format": 1,
         "stages": {name: cost for name in ("capture", "calibrate", "observe", "hull", "solve", "mesh")},

@@ -73,7 +73,7 @@ def test_the_report_of_a_whole_run_has_every_part(whole_page):
         "closed",
         "What the camera sees",
         "Does the surface explain the photos?",
-        "5 of 6 photos were used",
+        "5 of 6 photos of the object were used",
         "38 % of the ground is saturated",
         "± 1.3 px",
         "0.21 px",

@@ -181,6 +181,7 @@ def photos_part(
     if not rows:
         rows = [(stem, True, "") for stem in thumbs]
     dropped = [r for r in rows if not r[1]]
+    lit = [bool(p.get("used", True)) for p in photos if p.get("role", "lit") == "lit"] or [used for _, used, _ in rows]
     shown = "".join(
         doc.figure(reduced(thumbs[stem], THUMB_WIDTH), name if used else f"{name}: {reason}", "" if used else "dropped")
         for name, used, reason in rows
@@ -189,7 +190,7 @@ def photos_part(
     unseen = [f"{name}: not used, {why}" for name, _, why in dropped if Path(thumbnail_name(name)).stem not in thumbs]
     return doc.section(
         "Photos",
-        f"{len(rows) - len(dropped)} of {len(rows)} photos were used; grey ones were left out, for the reason given.",
+        f"{sum(lit)} of {len(lit)} photos of the object were used; grey ones were left out, for the reason given.",
         (f'<div class="grid">{shown}</div>' if shown else "") + doc.bullets(unseen) if rows else "",
     )
 
