@@ -62,6 +62,7 @@ NO_MEASUREMENT = (  # advice, names and examples
     "--orbit 90",
     "Exit code 2",
     "S3-NeRF",
+    "H200",
     "clip#t=12.340s.mov",
     "MP4",
     "1. The board",

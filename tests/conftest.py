@@ -4,6 +4,7 @@ The numba kernels cannot carry such wrappers.
 """
 
 import fcntl
+import gc
 import os
 import shutil
 import sys
@@ -64,10 +65,11 @@ CHECKED = [
     if path.stem != "__init__" and not path.stem.endswith("kernels")
 ]
 
+gc.disable()  # until all tests are imported: the collector would go through a million objects that stay, 3 s a process
 sys.dont_write_bytecode = False  # dozens of processes that tests start would compile every module, 4 s each
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 jaxtyping.jaxtyped = checked_signatures.wrap
-install_import_hook(CHECKED, "checked_signatures.when_called")
+install_import_hook(CHECKED, "beartype.beartype")
 
 
 # --- several processes -----------------------------------------------------------------------------------------------
@@ -91,6 +93,8 @@ def pytest_xdist_setupnodes() -> None:
     A plugin of jaxtyping imports NumPy before a worker comes here: it must be said before the worker starts.
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # numba's threads: they would compute nothing while they wait
+    gc.enable()  # this process imports no tests
 
 
 def pytest_runtest_setup() -> None:
@@ -102,6 +106,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest files come first: otherwise one process works on one of them when the others have nothing left."""
     place = {stem: at for at, stem in enumerate(LONGEST_FIRST)}
     items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+
+
+def pytest_collection_finish() -> None:
+    """What imports have made stays, so no later collection looks at it either. And torch has one thread, as was asked.
+
+    The first kernel that numba runs in parallel sets the number of threads of all OpenMP to the number of cores. Then
+    each small operation of torch waited for a second thread: where cores are busy, ten times as long as it took.
+    """
+    gc.freeze()
+    gc.enable()
+    if os.environ.get("OMP_NUM_THREADS") == "1" and {"numba", "torch"} <= sys.modules.keys():
+        sys.modules["numba"].get_num_threads()  # starts them
+        sys.modules["torch"].set_num_threads(1)
 
 
 @contextmanager

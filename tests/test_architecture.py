@@ -14,10 +14,12 @@ PACKAGES = ("capture", "calibration", "reconstruct", "viewer", "shadowgraph")
 ROOMY = 15  # modules of one package: more are two packages
 
 
-def listed_packages() -> list[str]:
+@cache
+def listed_packages() -> tuple[str, ...]:
     """The places of CONVENTIONS.md's list as dotted names, lowest first: packages, and single modules beside them."""
     text = (ROOT / "CONVENTIONS.md").read_text().split("```")[1]
-    return [line.split()[0].removesuffix(".py").rstrip("/").replace("/", ".") for line in text.strip().splitlines()]
+    lines = text.strip().splitlines()
+    return tuple(line.split()[0].removesuffix(".py").rstrip("/").replace("/", ".") for line in lines)
 
 
 @cache
@@ -33,10 +35,15 @@ def tree_of(path: Path) -> ast.Module:
 
 
 @cache
+def nodes_of(path: Path) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(tree_of(path)))
+
+
+@cache
 def imports(path: Path) -> frozenset[str]:
     """Every name that a file imports, dotted, wherever in the file it does so."""
     found = set()
-    for node in ast.walk(tree_of(path)):
+    for node in nodes_of(path):
         if isinstance(node, ast.ImportFrom) and node.module:
             assert node.level == 0, f"{path}:{node.lineno} imports from a relative name"
             found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
@@ -48,10 +55,11 @@ def imports(path: Path) -> frozenset[str]:
 @cache
 def named(path: Path) -> frozenset[str]:
     """Every module that a string of a file names, alone or as "module:function"."""
-    texts = {n.value for n in ast.walk(tree_of(path)) if isinstance(n, ast.Constant)}
+    texts = {n.value for n in nodes_of(path) if isinstance(n, ast.Constant)}
     return frozenset(text.partition(":")[0] for text in texts if isinstance(text, str))
 
 
+@cache
 def place_of(module: str) -> str:
     """The listed package or module that a module belongs to: itself, or the folder it lies in."""
     places = set(listed_packages()) & {module, module.rpartition(".")[0]}

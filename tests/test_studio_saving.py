@@ -69,15 +69,26 @@ def test_several_files_come_as_one_archive_and_are_forgotten_by_the_next_studio(
         assert not list((folder / ".studio" / "saved").iterdir())
 
 
-@pytest.mark.parametrize(
-    ("name", "size", "said"),
-    [("stl", "wide", "no number"), ("stl", "0", "no size to print"), ("../x", "", "no kind"), ("3mf", "nan", "size")],
+REFUSED = (  # format, size, what is said
+    ("stl", "wide", "no number"),
+    ("stl", "0", "no size to print"),
+    ("../x", "", "no kind"),
+    ("3mf", "nan", "size"),
 )
-def test_what_cannot_be_saved_is_a_sentence(folder, name, size, said):
-    with served(folder) as (_, _, owner):
-        answers = []
-        wait_until(lambda: answers.append(owner.post("save", key=RUN, format=name, size=size)) or answers[-1][0] != 200)
-        assert answers[-1][0] == 400 and said in answers[-1][1]["error"]
+
+
+def refusal(owner, name: str, size: str) -> tuple:
+    """The first answer that is none of a file under way."""
+    found: list[tuple] = []
+    wait_until(lambda: found.append(owner.post("save", key=RUN, format=name, size=size)) or found[-1][0] != 200)
+    return found[-1]
+
+
+def test_what_cannot_be_saved_is_a_sentence(folder):
+    with served(folder) as (_, _, owner):  # one for all: its helper takes 3 s to start
+        for name, size, said in REFUSED:
+            status, answer = refusal(owner, name, size)
+            assert status == 400 and said in answer["error"], (name, size)
 
 
 def row_of(owner, name: str) -> dict:
