@@ -1,5 +1,6 @@
 """Shadows on the ground and the object's outline, from what deviates from the ground's field; no light is needed."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -212,20 +213,26 @@ def _with_plinth(
 
     A plinth's level top is lit like the ground. Only its side is not: a strip, apart from what stands on the top.
     """
-    parts, found = np.empty(chosen.shape, np.int32), chosen.copy()
-    label(others, output=parts)
-    widest = LEAST_STRIP * _extent(chosen)
+    found = chosen.copy()
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, [2 * round(PLINTH_GAP * max(chosen.shape)) + 1] * 2)
-    for number in np.flatnonzero(np.bincount(parts.ravel()) > widest):
-        strip = parts == number
-        if number == 0 or _extent(strip) < widest:
-            continue
+    for strip in _long_parts(others, chosen):
         hull = convex_hull(strip)
         near, is_bent = cv2.dilate(hull.astype(np.uint8), disc) > 0, hull.sum() > BENT * strip.sum()
         if is_bent and chosen[hull].any():
             both = cv2.morphologyEx((found | hull).astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
             found |= (both & near) | hull
     return np.asarray(binary_fill_holes(found))
+
+
+def _long_parts(
+    others: Bool[np.ndarray, "height width"], mask: Bool[np.ndarray, "height width"]
+) -> Iterator[Bool[np.ndarray, "height width"]]:
+    """Yield the connected parts of a region that are not short beside the object: LEAST_STRIP of its extent."""
+    parts, least = np.empty(mask.shape, np.int32), LEAST_STRIP * _extent(mask)
+    label(others, output=parts)
+    for number in np.flatnonzero(np.bincount(parts.ravel()) > least):
+        if number > 0 and _extent(part := parts == number) >= least:
+            yield part
 
 
 def _with_stacked(
@@ -246,13 +253,10 @@ def _with_stacked(
         others: the other likely parts.
     """
     no_ground = _closed(likelihood > GROUND_LIKE) | (False if field.beyond is None else field.beyond)
-    parts, found, picture = np.empty(mask.shape, np.int32), mask.copy(), (slice(None), slice(None))
-    label(others, output=parts)
-    widest = LEAST_STRIP * _extent(mask)
-    for number in np.flatnonzero(np.bincount(parts.ravel()) > widest):
-        part = parts == number
+    found, picture = mask.copy(), (slice(None), slice(None))
+    for part in _long_parts(others, mask):
         top = ((_under(part) & _over(found)) | (_under(found) & _over(part))) & ~no_ground & ~found
-        if number == 0 or _extent(part) < widest or not top.any() or _extent(top) > _extent(found):
+        if not top.any() or _extent(top) > _extent(found):
             continue
         rows = cv2.dilate(top.astype(np.uint8), np.ones((RING, 1), np.uint8)).any(1, keepdims=True)
         beside = _ring(convex_hull(found | part).astype(np.uint8), no_ground) & rows
