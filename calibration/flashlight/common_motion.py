@@ -180,11 +180,10 @@ def _as_pictured(fit: FlashlightFit, evidence: Evidence) -> FlashlightFit:
 def _posteriors(found: Sequence[_Found], evidence: Evidence) -> Float[np.ndarray, " found"]:
     """Return the negative log posteriors of fits to the same evidence, up to a constant that they share.
 
-    The shading counts as cells whose errors are independent, -log of each by log(misfit). A misfit beyond noise is the
-    model's, and cells share it: of all fits, the one that explains the shading best tells how many are left.
+    The shading counts as cells whose errors are independent, as many as in the fits themselves: log(misfit) for each.
     """
     misfit = np.array([one[2] for one in found])
-    cells = (evidence.weight > 0).sum() / ALIKE * min(1.0, NOISE / float(misfit.min())) ** 2
+    cells = (evidence.weight > 0).sum() / ALIKE
     return np.array([one[0] for one in found]) + cells * np.log(misfit)
 
 
