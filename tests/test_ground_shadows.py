@@ -161,3 +161,26 @@ def test_what_stands_on_a_level_top_belongs_to_the_object_and_the_top_too():
 def test_a_thing_behind_the_object_with_ground_between_is_another():
     lower, upper, top, found = _two_boxes(0.0)
     assert found[lower].mean() > 0.95 and not found[upper].any() and found[top].mean() < 0.05
+
+
+def _table(step: float) -> tuple[np.ndarray, np.ndarray]:
+    """A table's top, whose near edge and sides are seen but not its far edge, and what is found.
+
+    step: log units by which the top is brighter or darker than the ground, in turns.
+    """
+    whole = (np.abs(COLUMNS - 80) < 40) & (np.abs(ROWS - 60) < 20)
+    top = (np.abs(COLUMNS - 80) < 38) & whole & (ROWS < 76)
+    field = _field(whole & ~top)
+    field.residual[:, top] += step * np.array([-1, 1, -1, 1, -1, 1])[:, None]
+    return top, find_shadows(field).object_mask
+
+
+def test_a_level_top_that_nothing_encloses_is_told_by_its_light():
+    """A table's: its far edge is not seen before the ground behind it."""
+    top, found = _table(0.06)
+    assert found[top].mean() > 0.95 and (found & (ROWS < 40)).sum() < 0.05 * top.sum()
+
+
+def test_ground_that_is_seen_above_the_object_past_its_sides_stays_ground():
+    top, found = _table(0.01)
+    assert found.any() and found[top].mean() < 0.05

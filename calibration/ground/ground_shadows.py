@@ -58,6 +58,7 @@ def find_shadows(field: GroundField) -> GroundShadows:
         mask = _largest(_across(likelihood, seam), field)
         likelihood = np.where(field.beyond | seam, np.float32(ODDS), likelihood)
     tops = _level_tops(field, likelihood, mask)
+    tops |= _open_tops(field, likelihood, mask | tops) & ~mask
     likelihood = np.where(tops, np.float32(ODDS), likelihood)
     return GroundShadows(visibility.astype(np.float32), dark, likelihood, mask | tops)
 
@@ -102,6 +103,32 @@ def _level_tops(
             if is_shaded or _is_lit_otherwise(_steps(field, around, hole > 0, _ring(hole, unlike[around]))):
                 found[around] |= edge
     return found
+
+
+def _open_tops(
+    field: GroundField, likelihood: Float[np.ndarray, "height width"], mask: Bool[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """Return the object's level tops whose far edge is not seen: nothing encloses them, as a table's before the ground.
+
+    They lie in what the object's convex hull has above the object in the picture. Ground that is seen there, past a
+    handle or between ears, follows the light of the ground around; a top does not (OTHER_LIGHT).
+
+    Args: as for _level_tops.
+    """
+    found, unlike = np.zeros(mask.shape, bool), _closed(likelihood > GROUND_LIKE) | mask
+    if not mask.any():
+        return found
+    wide = _grown(mask)  # between the object's side and its top lies a pixel that is like neither
+    for pocket in _long_parts(convex_hull(mask) & _over(mask) & ~unlike, mask):
+        steps = _steps(field, (slice(None), slice(None)), pocket, _ring(pocket.astype(np.uint8), unlike))
+        if _is_lit_otherwise(steps):
+            top = _with_whole_top(field, steps, wide) & ~wide
+            found |= (top | (_grown(top) & wide)) & ~mask
+    return found
+
+
+def _grown(region: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    return cv2.dilate(region.astype(np.uint8), NEIGHBOURS) > 0
 
 
 def _ring(
