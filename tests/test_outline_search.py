@@ -77,6 +77,54 @@ def test_the_search_follows_its_best_starts_and_says_how_far_likely_ones_lie_apa
     assert not told_doubt(replace(fit, between=0.0))
 
 
+def _with_one_lost(maps, lights: np.ndarray, k: int) -> tuple[FlashlightFit, Evidence]:
+    """A state with one light on the other side, and the evidence."""
+    evidence = _shaded(maps, lights)
+    places = np.where(np.arange(len(lights))[:, None] == k, lights * [-1, -1, 1], lights)
+    beam = np.array([3.0, 0.0, 0.0, 0.0])
+    state = Flashlights(places, 0 * places, np.zeros(len(lights)), beam, 0.0, np.zeros(3))
+    weight = evidence.weight * (np.arange(len(lights)) != k)[:, None]
+    return FlashlightFit(state, evidence, weight, common_motion.LOOSE, free_tangent), evidence
+
+
+def test_a_pass_begins_with_a_light_that_misfits_where_its_shading_puts_it(ball):
+    """The others stay. Places that are tried lie 22 degrees and a third of the distance apart."""
+    _, lights, maps = ball
+    fit, evidence = _with_one_lost(maps, lights, 3)
+    moved = common_motion._where_shading_puts(fit, evidence)
+    others = np.arange(len(lights)) != 3
+    np.testing.assert_array_equal(moved[others], lights[others])
+    assert _off(moved, lights)[3] < 0.3 < 0.8 < _off(fit.flashlights.positions, lights)[3]
+    assert evidence.outlines is not None
+    untrusted = replace(evidence, outlines=replace(evidence.outlines, trusted=others))
+    np.testing.assert_array_equal(common_motion._where_shading_puts(fit, untrusted), fit.flashlights.positions)
+
+
+def test_a_photo_that_the_shading_contradicts_is_a_stray_whatever_its_outline(ball):
+    """Its light is where its shadow says, but its ground is lit from elsewhere."""
+    _, lights, maps = ball
+    fit, evidence = _with_one_lost(maps, lights, 3)
+    fit = replace(fit, flashlights=replace(fit.flashlights, positions=lights), weight=evidence.weight)
+    assert not outline_lights._contradicts(fit).any()
+    grey = evidence.log_grey.copy()
+    grey[3] = evidence.log_grey[7]
+    strays = outline_lights._contradicts(replace(fit, evidence=replace(evidence, log_grey=grey)))
+    np.testing.assert_array_equal(np.flatnonzero(strays), [3])
+
+
+@pytest.mark.slow
+def test_places_that_cannot_be_among_the_best_are_asked_no_further(ball):
+    """The best three have their whole cost, the others a bound below theirs and above the third."""
+    _, lights, maps = ball
+    every = np.ones(len(lights), bool)
+    costs = OutlineTerms(maps, EYE, 0.0, every, every).costs(lights, 4)
+    places = lights[4] * np.exp(0.3 * np.random.default_rng(2).standard_normal((60, 3)))
+    whole, bound = costs(places, 2.0), costs.lowest(places, 2.0, 3)
+    best = np.argsort(whole)[:3]
+    np.testing.assert_array_equal(bound[best], whole[best])
+    assert (bound <= whole).all() and (bound >= whole[best[-1]]).sum() >= 58 and (bound < whole).sum() > 20
+
+
 @pytest.mark.slow
 def test_of_blurred_outlines_fewer_rays_are_asked_and_say_about_the_same(ball):
     """The cost of all rays, with one light at places that are 10 to 30 % too far and turned."""

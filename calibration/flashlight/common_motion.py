@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from calibration.flashlight.beam_aims import looked_for_aims
+from calibration.flashlight.beam_aims import looked_for_aims, places_by_shading
 from calibration.flashlight.beam_profile import EXTRA_TERMS, RING_TERMS
-from calibration.flashlight.fit import FAR, NEAR, START_BEAM, FlashlightFit
+from calibration.flashlight.fit import FAR, NEAR, START_BEAM, FlashlightFit, may_be_misplaced
 from calibration.flashlight.model import (
     NOISE,
     Evidence,
@@ -49,9 +49,10 @@ def searched(starts: list[Float[np.ndarray, "photos 3"]], evidence: Evidence) ->
 
     Outlines alone pull all lights too near, and one light that is too near, its beam aimed elsewhere, may agree with
     its photo. So both are fitted from the first step on, with an outline's sigma that falls to its own (graduated
-    non-convexity) [Blake and Zisserman, Visual Reconstruction (1987)]; the best are followed by further passes, and by
-    one that begins with all beams aimed alike. What is best is decided by the cost of everything. `between` of the fit
-    holds what the others say that explain the photos about as well.
+    non-convexity) [Blake and Zisserman, Visual Reconstruction (1987)]; the best are followed by further passes, which
+    begin with lights that misfit where shading puts them, and by one that begins with all beams aimed alike. What is
+    best is decided by the cost of everything. `between` of the fit holds what the others say that explain the photos
+    about as well.
 
     Args:
         starts: positions, world.
@@ -87,7 +88,16 @@ def _followed(found: _Found, evidence: Evidence) -> _Found:
 
 def _again(found: _Found, evidence: Evidence, aims: tuple[float, ...]) -> _Found:
     _, fit, misfit = found
-    return _pass(fit.flashlights.positions, evidence, misfit, fit.flashlights, aims)
+    return _pass(_where_shading_puts(fit, evidence), evidence, misfit, fit.flashlights, aims)
+
+
+def _where_shading_puts(fit: FlashlightFit, evidence: Evidence) -> Float[np.ndarray, "photos 3"]:
+    """Return the places (world) of a fit; those of trusted photos that misfit are replaced by their shading's best."""
+    assert evidence.outlines is not None
+    places = fit.flashlights.positions.copy()
+    for k in np.flatnonzero(may_be_misplaced(fit) & evidence.outlines.trusted).tolist():
+        places[k] = [*places_by_shading(fit.flashlights, fit.evidence, fit.weight, k, 1), places[k]][0]
+    return places
 
 
 def _pass(

@@ -26,6 +26,8 @@ from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
 
 MIN_PHOTOS = 4
+DROP_RESIDUAL = 3.5  # of the median photo: shaken, or not lit by the flashlight
+DROP_SHARE = 0.4  # least share of the ground that must follow the model
 MIN_GROUND = 100  # cells that behave like ground; fewer do not tell position, aim and beam apart
 OBJECT_LIGHT = 0.2  # times (R / d)^2: what an object of radius R sends, of its own light, to the ground at distance d
 FAR = tuple([RobustWeights(2.5, False)] * 15)  # far from the answer no sample is forgotten ...
@@ -285,10 +287,21 @@ def photo_quality(fit: FlashlightFit):
     return residual / max(float(np.median(residual)), 1e-6), share
 
 
+def does_not_follow(fit: FlashlightFit) -> Bool[np.ndarray, " photos"]:
+    """Return which photos the shading contradicts: their lights are not used."""
+    residual, share = photo_quality(fit)
+    return (residual > DROP_RESIDUAL) | (share < DROP_SHARE)
+
+
+def may_be_misplaced(fit: FlashlightFit) -> Bool[np.ndarray, " photos"]:
+    """Return which photos misfit twice as much as usual, or half of whose ground does not follow."""
+    residual, share = photo_quality(fit)
+    return (residual > REFIT_RESIDUAL) | (share < 0.5)
+
+
 def refit_outliers(fit: FlashlightFit) -> FlashlightFit:
     """Refit after photos with large residuals have tried other starts, one per ring of the hemisphere."""
-    residual, share = photo_quality(fit)
-    stray = (residual > REFIT_RESIDUAL) | (share < 0.5)
+    stray = may_be_misplaced(fit)
     if not stray.any() or stray.sum() > 0.5 * len(stray):
         return fit
     thin, log_grey = _thinned(fit.evidence)

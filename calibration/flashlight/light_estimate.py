@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float
 from calibration.flashlight.beam_profile import without_splines
 from calibration.flashlight.duplicates import earlier_duplicate
 from calibration.flashlight.fit import (
+    DROP_RESIDUAL,
+    DROP_SHARE,
     LAST,
     FlashlightFit,
     before_ends,
@@ -41,8 +43,6 @@ from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
 from capture.photos.photo import PhotoStack
 
-DROP_RESIDUAL = 3.5  # of the median photo: shaken, or not lit by the flashlight
-DROP_SHARE = 0.4  # least share of the ground that must follow the model
 OTHER_POWER = 3.0  # factor between one flashlight's power in two photos
 POWER_SIGMAS = 6.0  # or in how much the other photos differ, where they do not tell their exposure
 LOWEST = 0.08  # of the camera's distance: no hand holds a flashlight lower

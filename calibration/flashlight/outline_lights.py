@@ -13,14 +13,21 @@ from operator import itemgetter
 import numpy as np
 from jaxtyping import Bool, Float
 
-from calibration.flashlight.beam_aims import looked_for_aims
+from calibration.flashlight.beam_aims import looked_for_aims, places_by_shading
 from calibration.flashlight.common_motion import (
     CONTRASTS,
     LOOSE,
     at_best_contrast,
     searched,
 )
-from calibration.flashlight.fit import FAR, MIN_GROUND, NEAR, FlashlightFit
+from calibration.flashlight.fit import (
+    FAR,
+    MIN_GROUND,
+    NEAR,
+    FlashlightFit,
+    does_not_follow,
+    may_be_misplaced,
+)
 from calibration.flashlight.model import (
     PER_FLASHLIGHT,
     Evidence,
@@ -50,7 +57,7 @@ THIN = 4  # every fourth ground cell: misfits are smooth over many
 LIT = 0.85  # visibility from which a cell's brightness counts
 UNUSUAL = 2.0  # sigmas of a distance from which a light is looked for again
 ROUNDS = 3  # in which lights are located among those that are known by then, at most
-TRIED = 4  # likely places of a stray light that are fitted to outlines and shading
+TRIED = 4  # places of a stray light by outlines, and as many by shading, that are fitted to both
 FEWEST_WHOLE = 8  # photos whose shadows the picture does not cut
 OUTLINES_WRONG = 1 / 3  # of the trusted photos at odds: more than are ever bad, so the object's outline is wrong, ...
 REPAIRED = 0.5  # ... and its hull is right if it leaves less than this share of them at odds
@@ -160,10 +167,12 @@ def _with_strays(
 ) -> FlashlightFit:
     """Locate the photos whose shadows are cut, or contradict the others, once these are known; refit all together.
 
-    Tried for each: where outlines alone put it, and where shading alone did; outlines and shading together decide.
+    So are those whose shading misfits: a shadow may agree with the others from a wrong place. Tried for each: where
+    outlines alone put it, where shading alone did, and where it does now, with albedo, beam and power of the others;
+    outlines and shading together decide.
     """
     assert fit.evidence.outlines is not None
-    strays = ~whole | _is_stray(fit.evidence.outlines, fit.flashlights.positions)
+    strays = ~whole | _is_stray(fit.evidence.outlines, fit.flashlights.positions) | may_be_misplaced(fit)
     for _ in range(ROUNDS):
         if not strays.any():
             break
@@ -180,8 +189,9 @@ def _with_strays(
 
 
 def _contradicts(fit: FlashlightFit) -> Bool[np.ndarray, " photos"]:
+    """Return which photos the others' shadows, or the ground's shading, contradict."""
     assert fit.evidence.outlines is not None
-    return fit.evidence.outlines.misfit(fit.flashlights.positions) > DROP_OUTLINE
+    return (fit.evidence.outlines.misfit(fit.flashlights.positions) > DROP_OUTLINE) | does_not_follow(fit)
 
 
 def _located(
@@ -198,7 +208,8 @@ def _located(
         alone = ~strays | (np.arange(len(strays)) == k)
         places = flashlights.positions
         likely = likely_places(replace(terms, trusted=alone), places, k, np.stack([start[k], places[k]]))
-        tries = [_alone(fit, flashlights, k, one, alone, cut) for one in (*likely[:TRIED], by_shading[k])]
+        lit = places_by_shading(flashlights, fit.evidence, fit.weight, k, TRIED)
+        tries = [_alone(fit, flashlights, k, one, alone, cut) for one in (*likely[:TRIED], *lit, by_shading[k])]
         flashlights = min(tries, key=itemgetter(1))[0]
     return flashlights
 

@@ -119,23 +119,30 @@ class OneLight:
         where = _where(maps, self._views, others_used, self._soft)
         proven_by_others(self._starts, self._owner, *where, _heights(maps), self._worst)
 
-    def emptiness(self, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, "places rays"]:
-        """Return the emptiness of every ray, the light's own last."""
-        from calibration.outlines.coherence_kernels import least_empty, least_with_places
+    def emptiness_of_others(self, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, "places others"]:
+        """Return the emptiness of the other lights' rays."""
+        from calibration.outlines.coherence_kernels import least_with_places
 
-        maps, photo, heights = self._maps, self._photo, _heights(self._maps)
-        own_soft = softness(maps, places)
+        maps, photo = self._maps, self._photo
         found = np.empty((len(places), len(self._starts)))
-        where = (maps.corner, maps.cell, heights, self._soft, self._worst, places, own_soft, found)
+        where = (maps.corner, maps.cell, _heights(maps), self._soft, self._worst, places, softness(maps, places), found)
         least_with_places(self._starts, self._owner, self._views, maps.fields[photo], *where)
-        mine = self._mine
+        return found
+
+    def own_emptiness(self, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, "places own"]:
+        """Return the emptiness of the light's own rays: most of the work."""
+        from calibration.outlines.coherence_kernels import least_empty
+
+        maps, mine, photo = self._maps, self._mine, self._photo
         own, views, soft = np.empty((len(places), mine.sum())), self._views.copy(), self._soft.copy()
         height, by, first_step = np.empty(mine.sum()), np.empty(mine.sum(), np.int64), maps.first_step[mine]
-        for number, place in enumerate(places):
-            views[photo], soft[photo] = place, own_soft[number]
+        for number, (place, softer) in enumerate(zip(places, softness(maps, places), strict=True)):
+            views[photo], soft[photo] = place, softer
             where = _where(maps, views, self._used, soft)
-            least_empty(maps.starts[mine], maps.owner[mine], *where, heights, first_step, own[number], height, by)
-        return np.concatenate([found, own], 1)
+            least_empty(
+                maps.starts[mine], maps.owner[mine], *where, _heights(maps), first_step, own[number], height, by
+            )
+        return own
 
 
 def _where(maps: OutlineMaps, views: np.ndarray, used: np.ndarray, soft: np.ndarray):

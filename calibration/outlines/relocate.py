@@ -9,7 +9,8 @@ from calibration.outlines.terms import OutlineTerms
 SLANT, FARTHER = 0.25, 0.25  # one step of a grid: log of x / z; log of the distance
 NEAR_BY = (0.125, (4, 3, 2))  # radians of one step of turning; steps to each side: turned, slanted, farther, ...
 ALL_AROUND = (np.pi / 12, (12, 5, 3))  # ... and of a coarse grid, for starts that are wrong
-MINIMA = 6  # of each grid, that are followed
+MINIMA = 6  # of each grid, that are followed, ...
+LOWEST = 60  # ... of its lowest places
 APART = 0.03  # of the distance from the foot: nearer places are one
 BLURS = (6.0, 2.0, 1.0)  # of an outline's sigma, for steps that are 1, 1/3, 1/9 as wide
 
@@ -30,7 +31,7 @@ def likely_places(
     found = []
     for turning, steps in (NEAR_BY, ALL_AROUND):
         grid = _around(starts[0] - foot, 1.0, steps, turning) + foot
-        cost = cost_at(grid.reshape(-1, 3), BLURS[0]).reshape(grid.shape[:3])
+        cost = cost_at.lowest(grid.reshape(-1, 3), BLURS[0], LOWEST).reshape(grid.shape[:3])
         lowest = np.argwhere(cost == minimum_filter(cost, 3))
         lowest = lowest[np.argsort(cost[tuple(lowest.T)])][:MINIMA]
         found.extend(grid[tuple(lowest.T)])
@@ -39,7 +40,7 @@ def likely_places(
     for level, blur in enumerate(BLURS[1:], 1):
         for number, place in enumerate(found):
             near = _around(place - foot, 3.0**-level, (1, 1, 1)).reshape(-1, 3) + foot
-            cost = cost_at(near, blur)
+            cost = cost_at.lowest(near, blur, 1)
             found[number], costs[number] = near[int(np.argmin(cost))], cost.min()
     apart: list[np.ndarray] = []
     for number in np.argsort(costs):
