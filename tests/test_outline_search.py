@@ -7,7 +7,7 @@ import pytest
 from ball_shadows import EYE, RADIUS, drawn
 
 from calibration.flashlight import common_motion, outline_lights
-from calibration.flashlight.fit import FlashlightFit
+from calibration.flashlight.fit import FlashlightFit, does_not_follow
 from calibration.flashlight.light_estimate import AMBIGUOUS, told_doubt
 from calibration.flashlight.model import Evidence, Flashlights, free_tangent, log_irradiance
 from calibration.lights.ground_cells import GroundCells
@@ -110,6 +110,25 @@ def test_a_photo_that_the_shading_contradicts_is_a_stray_whatever_its_outline(ba
     grey[3] = evidence.log_grey[7]
     strays = outline_lights._contradicts(replace(fit, evidence=replace(evidence, log_grey=grey)))
     np.testing.assert_array_equal(np.flatnonzero(strays), [3])
+
+
+def test_a_photo_is_a_stray_where_less_of_its_ground_follows_than_of_the_others(ball):
+    """Of a beam with rings a third of the ground may follow in every photo: that tells nothing of one of them."""
+    _, lights, maps = ball
+    fit, evidence = _with_one_lost(maps, lights, 3)
+    follows = np.random.default_rng(5).random(evidence.weight.shape) < 0.35
+    follows[5] &= np.arange(follows.shape[1]) % 4 == 0
+    fit = replace(fit, flashlights=replace(fit.flashlights, positions=lights), weight=evidence.weight * follows)
+    np.testing.assert_array_equal(np.flatnonzero(does_not_follow(fit)), [5])
+
+
+@pytest.mark.slow
+def test_a_further_pass_brings_a_lost_light_back_and_ends_where_nothing_is_gained(ball):
+    _, lights, maps = ball
+    fit, evidence = _with_one_lost(maps, lights, 3)
+    found = common_motion.passed_again(fit.flashlights, evidence)
+    assert found is not None and _off(found.flashlights.positions, lights)[3] < 0.06
+    assert common_motion.passed_again(found.flashlights, evidence) is None
 
 
 @pytest.mark.slow

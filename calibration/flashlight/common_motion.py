@@ -91,6 +91,15 @@ def _again(found: _Found, evidence: Evidence, aims: tuple[float, ...]) -> _Found
     return _pass(_where_shading_puts(fit, evidence), evidence, misfit, fit.flashlights, aims)
 
 
+def passed_again(flashlights: Flashlights, evidence: Evidence) -> FlashlightFit | None:
+    """Return the fit after one more pass of the search, or None if that explains the photos no better."""
+    trusted = _trusted(evidence, USUAL_MISFIT)
+    found = _settled(flashlights, evidence, trusted, LOOSE)
+    further = _again(found, evidence, FREE_AIMS)
+    before, after = _posteriors([found, further], trusted)
+    return further[1] if before - after > GAIN else None
+
+
 def _where_shading_puts(fit: FlashlightFit, evidence: Evidence) -> Float[np.ndarray, "photos 3"]:
     """Return the places (world) of a fit; those of trusted photos that misfit are replaced by their shading's best."""
     assert evidence.outlines is not None

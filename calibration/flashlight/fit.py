@@ -27,7 +27,7 @@ from capture.photos.photo import PhotoStack
 
 MIN_PHOTOS = 4
 DROP_RESIDUAL = 3.5  # of the median photo: shaken, or not lit by the flashlight
-DROP_SHARE = 0.4  # least share of the ground that must follow the model
+DROP_SHARE = 0.4  # of the median photo's share: least part of the ground that must follow the model
 MIN_GROUND = 100  # cells that behave like ground; fewer do not tell position, aim and beam apart
 OBJECT_LIGHT = 0.2  # times (R / d)^2: what an object of radius R sends, of its own light, to the ground at distance d
 FAR = tuple([RobustWeights(2.5, False)] * 15)  # far from the answer no sample is forgotten ...
@@ -290,7 +290,12 @@ def photo_quality(fit: FlashlightFit):
 def does_not_follow(fit: FlashlightFit) -> Bool[np.ndarray, " photos"]:
     """Return which photos the shading contradicts: their lights are not used."""
     residual, share = photo_quality(fit)
-    return (residual > DROP_RESIDUAL) | (share < DROP_SHARE)
+    return (residual > DROP_RESIDUAL) | (share < least_share(share))
+
+
+def least_share(share: Float[np.ndarray, " photos"]) -> float:
+    """Return the share of the ground that must follow the model: of a beam with rings half does in a usual photo."""
+    return DROP_SHARE * float(np.median(share))
 
 
 def may_be_misplaced(fit: FlashlightFit) -> Bool[np.ndarray, " photos"]:

@@ -10,7 +10,6 @@ from calibration.flashlight.beam_profile import without_splines
 from calibration.flashlight.duplicates import earlier_duplicate
 from calibration.flashlight.fit import (
     DROP_RESIDUAL,
-    DROP_SHARE,
     LAST,
     FlashlightFit,
     before_ends,
@@ -18,6 +17,7 @@ from calibration.flashlight.fit import (
     first_guess,
     fit_flashlights,
     half_angles,
+    least_share,
     photo_quality,
     refit_outliers,
     with_oval_beams,
@@ -168,8 +168,10 @@ def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: l
             why.append(f"the ground is lit as in {names[duplicate[k]]}: a copy of it, or the flashlight was not moved")
         if residual[k] > DROP_RESIDUAL:
             why.append(f"the ground's shading misfits {residual[k]:.1f} times as much as usual (limit {DROP_RESIDUAL})")
-        if share[k] < DROP_SHARE:
-            why.append(f"only {share[k]:.0%} of the ground is lit as by one flashlight (limit {DROP_SHARE:.0%})")
+        if share[k] < least_share(share):
+            why.append(
+                f"only {share[k]:.0%} of the ground is lit as by one flashlight (limit {least_share(share):.0%})"
+            )
         if height[k] < LOWEST * cells.scale:
             why.append(f"the light would be {height[k]:.0f} above the ground (limit {LOWEST * cells.scale:.0f})")
         if not RANGES[0] < reach[k] / cells.scale < RANGES[1]:

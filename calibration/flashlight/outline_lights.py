@@ -18,6 +18,7 @@ from calibration.flashlight.common_motion import (
     CONTRASTS,
     LOOSE,
     at_best_contrast,
+    passed_again,
     searched,
 )
 from calibration.flashlight.fit import (
@@ -97,7 +98,7 @@ def with_outlines(
         fit, number = searched(starts, replace(cells, outlines=wide))
     if _ground(fit) < MIN_GROUND / THIN:
         return None
-    complete = _with_strays(fit, starts[number], by_shading, terms.trusted)
+    complete = _completed(fit, cells, starts[number], by_shading)
     # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share
     contrasts = (1.0,) if stack.is_linear else CONTRASTS
     found = at_best_contrast(complete.flashlights, replace(cells, outlines=complete.evidence.outlines), contrasts)
@@ -157,6 +158,22 @@ def _ground(fit: FlashlightFit) -> int:
 
 def _is_stray(terms: OutlineTerms, places: Float[np.ndarray, "photos 3"]) -> Bool[np.ndarray, " photos"]:
     return (terms.misfit(places) > DROP_OUTLINE) | (np.abs(terms.unusual(places)) > UNUSUAL)
+
+
+def _completed(
+    fit: FlashlightFit, cells: Evidence, start: Float[np.ndarray, "photos 3"], by_shading: Float[np.ndarray, "photos 3"]
+) -> FlashlightFit:
+    """Locate the stray lights; search on with all, since the others have bent towards strays that were wrong."""
+    assert fit.evidence.outlines is not None
+    complete = _with_strays(fit, start, by_shading, fit.evidence.outlines.trusted)
+    for _ in range(ROUNDS - 1):
+        outlines = complete.evidence.outlines
+        assert outlines is not None
+        better = None if complete is fit else passed_again(complete.flashlights, replace(cells, outlines=outlines))
+        if better is None:
+            break
+        complete, fit = _with_strays(better, start, by_shading, outlines.trusted), better
+    return complete
 
 
 def _with_strays(
