@@ -39,7 +39,8 @@ POWER_ERROR = 0.012  # spread of fitted powers that a perfectly steady flashligh
 POWER_SHARE = 0.5  # of the spread beyond that: a belief this wide still steadies the positions
 POWER_VOTE = 0.1  # in the search, a flashlight 10 % brighter than the others counts like 1 % of misfit
 START_BEAM = 2.0  # cos^2: between a bare LED and a focused one
-REFIT_RESIDUAL = 2.0  # of the median photo: such a photo may sit in a wrong minimum
+REFIT_RESIDUAL = 2.0  # of the median photo: such a photo may sit in a wrong minimum, ...
+REFIT_SHARE = 0.5  # ... or one of less ground that follows than this share of the median photo's
 GLOSS_ANGLE = np.radians(22.0)  # half angle below which a glossy table mirrors the light
 GLOSS_RISE = 0.03
 OVAL_GAIN = 0.85  # of the residual: round beams keep 0.98, beams with 2 % of asymmetry at 40 degrees go to 0.5
@@ -299,9 +300,9 @@ def least_share(share: Float[np.ndarray, " photos"]) -> float:
 
 
 def may_be_misplaced(fit: FlashlightFit) -> Bool[np.ndarray, " photos"]:
-    """Return which photos misfit twice as much as usual, or half of whose ground does not follow."""
+    """Return which photos misfit twice as much as usual, or show half as much ground that follows."""
     residual, share = photo_quality(fit)
-    return (residual > REFIT_RESIDUAL) | (share < 0.5)
+    return (residual > REFIT_RESIDUAL) | (share < REFIT_SHARE * float(np.median(share)))
 
 
 def refit_outliers(fit: FlashlightFit) -> FlashlightFit:
