@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from capture.checks.alignment import ANCHORS, FEWEST_PHOTOS, SHOWN, CommonView, allowed_px, densest
 from capture.checks.board_alignment import HomeView, board_findings, home_view
+from capture.checks.edge_sharpness import SMEARED, edge_sharpness
 from capture.checks.finding import Finding
 from capture.checks.registration import is_lit, middle_of, moved_back, texture_of
 from capture.checks.robust import column_spread
@@ -56,6 +57,7 @@ def view_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack |
     low = _low_contrast(_contrasts(view))
     seen = [_usual_slope(one, steady) for one in shown]
     moved, limits = _moved_photos(home, [not slope < SAME_VIEW for slope in seen], steady)
+    sharpness = edge_sharpness(stack.rgb[list(indices)])
     found = []
     for k, i in enumerate(indices):
         path = stack.paths[i]
@@ -69,6 +71,11 @@ def view_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack |
         elif (share := _hidden_share(view, k, shown[k], steady)) > COVERED:
             text = f"something that the other photos do not show covers at least {share:.0%} of the picture"
             found.append(Finding(path, "covered", f"{text}, {COVERED:.0%} may be", share, COVERED, True))
+        elif sharpness[k] < SMEARED:
+            text = (
+                f"its sharpest edges are {sharpness[k]:.2f} times as steep as in the other photos, {SMEARED:.2f} needed"
+            )
+            found.append(Finding(path, "blurred", f"{text}: shaken or out of focus", sharpness[k], SMEARED, True))
     many = sum(finding.kind == "covered" for finding in found) > OFTEN * len(indices)
     found = [finding for finding in found if not (many and finding.kind == "covered")]
     left_out = {finding.photo for finding in found}
