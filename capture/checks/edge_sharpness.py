@@ -15,7 +15,7 @@ DARKEST = 0.03  # of white, in the picture: darker regions are noise
 FEWEST = 0.001  # of the picture: pixels at edges across one way that tell how sharp these are
 SHARPEST = 95  # percentile of these: shadows' edges are soft, the object's are not
 SOFTEST = 2  # ways that are asked: shake smears the edges across one way, and some across the next
-SMEARED = 0.76  # of the usual; shaken photos gave 0.58 to 0.75 (34 of 34), good ones 0.77 and more (all but 3 of 330)
+SMEARED = 0.76  # of the usual; shaken photos gave 0.58 to 0.75 (32 of 32), good ones 0.77 and more (all but 4 of 327)
 
 
 def edge_sharpness(rgb: Float[np.ndarray, "photos height width 3"]) -> Float[np.ndarray, " photos"]:
