@@ -82,7 +82,8 @@ def _misfits(
 ) -> tuple[Float[np.ndarray, " trials"], Float[np.ndarray, " trials"]]:
     """Return photo k's median absolute residual from each place and target, an unusual power added; and log powers."""
     use = thin.weight[k] > 0
-    cells = replace(thin.cells, points=thin.cells.points[use], rgb=thin.cells.rgb[:, use])
+    cells = thin.cells
+    cells = replace(cells, points=cells.points[use], rgb=cells.rgb[:, use], usable=cells.usable[:, use])
     own = Evidence(cells, thin.height, thin.log_grey[:, use], thin.weight[:, use])
     state = replace(flashlights, positions=places, targets=targets, log_power=np.zeros(len(places)))
     residual = own.log_grey[k] - level[use] - log_irradiance(state, own)
