@@ -33,6 +33,7 @@ NARROW_AIMS = (0.1, 0.12, 0.15, 0.2, 0.25, 0.3)  # ... and in a pass that begins
 FOLLOWED = 2  # starts, the best of one pass, that are followed by further ones
 PASSES = 3  # of these, at most, ...
 LOST = 1e9  # the cost of lights that no ground follows
+NO_GROUND = 1e-6  # log units: a misfit of less is that of no cell
 GAIN = 2.0  # ... while each gains more than this of the negative log posterior
 SMALL = (-0.1, 0.0, 0.1)  # homologies, of the median 1 / z
 MORE_SCANS = 4  # at most, where the best start is the first or the last of its scan
@@ -201,7 +202,7 @@ def _posteriors(found: Sequence[_Found], evidence: Evidence) -> Float[np.ndarray
 
     The shading counts as cells whose errors are independent, as many as in the fits themselves: log(misfit) for each.
     """
-    misfit = np.array([one[2] for one in found])
+    misfit = np.maximum([one[2] for one in found], NO_GROUND)
     cells = (evidence.weight > 0).sum() / ALIKE
     return np.array([one[0] for one in found]) + cells * np.log(misfit)
 
