@@ -108,6 +108,19 @@ def hemisphere(cells: GroundCells) -> list[Float[np.ndarray, "candidates 3"]]:
     return rings
 
 
+def misfits(residual: Float[np.ndarray, "trials cells"], common: float | None):
+    """Return the median absolute residual of each trial (log units), an unusual power added, and its log power.
+
+    Args:
+        common: log power that flashlights are expected to share; None if unknown.
+    """
+    offset = np.median(residual, axis=1)
+    size = np.median(np.abs(residual - offset[:, None]), axis=1)
+    if common is not None:
+        size += POWER_VOTE * np.minimum(np.abs(offset - common), 1)
+    return size, offset
+
+
 @dataclass(frozen=True)
 class _Search:
     """Candidate places of flashlights, and the log irradiance from each at every cell of the evidence."""
@@ -132,11 +145,7 @@ class _Search:
         index, power = [], []
         for row in brightness:
             known = np.isfinite(row)
-            residual = row[known] - self.table[:, known]
-            offset = np.median(residual, axis=1)
-            size = np.median(np.abs(residual - offset[:, None]), axis=1)
-            if common is not None:
-                size += POWER_VOTE * np.minimum(np.abs(offset - common), 1)
+            size, offset = misfits(row[known] - self.table[:, known], common)
             index.append(int(np.argmin(size)))
             power.append(offset[index[-1]])
         return np.array(index), np.array(power)
@@ -147,9 +156,7 @@ def _thinned(evidence: Evidence, step: int = 4):
     keep = np.flatnonzero((evidence.weight > 0).mean(0) > 0.5)[::step]
     if len(keep) * step < MIN_GROUND:
         raise too_little_ground(len(keep) * step)
-    cells = evidence.cells
-    cells = replace(cells, points=cells.points[keep], rgb=cells.rgb[:, keep], usable=cells.usable[:, keep])
-    thin = Evidence(cells, evidence.height, evidence.log_grey[:, keep], evidence.weight[:, keep])
+    thin = evidence.at(keep)
     return thin, np.where(thin.weight > 0, thin.log_grey, np.nan)
 
 

@@ -16,10 +16,10 @@ reflectance that depends on the fixed view alone. Only brightness ratios between
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
 from calibration.flashlight.beam_profile import SMOOTH_TERMS, derivatives
@@ -105,6 +105,12 @@ class Evidence:
     log_grey: Samples
     weight: Samples  # 1 / variance; 0 where unusable
     outlines: OutlineTerms | None = None  # of shadows and object, for the same photos
+
+    def at(self, some: Int[np.ndarray, " some"] | Bool[np.ndarray, " cells"]) -> "Evidence":
+        """Return the evidence of some cells, without outlines."""
+        cells = self.cells
+        cells = replace(cells, points=cells.points[some], rgb=cells.rgb[:, some], usable=cells.usable[:, some])
+        return Evidence(cells, self.height, self.log_grey[:, some], self.weight[:, some])
 
     @staticmethod
     def of(cells: GroundCells, gains: Float[np.ndarray, " photos"], height: float) -> "Evidence":

@@ -304,10 +304,8 @@ def outline_sigma(fit: FlashlightFit) -> Float[np.ndarray, "photos 3"]:
 def _lit_cells(evidence: Evidence, shadows: GroundShadows, posed_camera: PosedCamera) -> Evidence:
     """Keep every THIN-th ground cell, and of its samples those that are lit ground."""
     height, width = shadows.object_mask.shape
-    cells = evidence.cells
-    points = cells.points[::THIN]
-    pixels = np.rint(posed_camera.resized(width, height).project(points)).astype(int)
+    thin = evidence.at(np.arange(0, len(evidence.cells.points), THIN))
+    pixels = np.rint(posed_camera.resized(width, height).project(thin.cells.points)).astype(int)
     column, row = np.clip(pixels[:, 0], 0, width - 1), np.clip(pixels[:, 1], 0, height - 1)
     lit = (shadows.visibility[:, row, column] > LIT) & (shadows.likelihood[row, column] < GROUND_LIKE)
-    thin = replace(cells, points=points, rgb=cells.rgb[:, ::THIN], usable=cells.usable[:, ::THIN])
-    return Evidence(thin, evidence.height, evidence.log_grey[:, ::THIN], evidence.weight[:, ::THIN] * lit)
+    return replace(thin, weight=thin.weight * lit)

@@ -58,7 +58,7 @@ def find_shadows(field: GroundField) -> GroundShadows:
         mask = _largest(_across(likelihood, seam), field)
         likelihood = np.where(field.beyond | seam, np.float32(ODDS), likelihood)
     tops = _level_tops(field, likelihood, mask)
-    tops |= _open_tops(field, likelihood, mask | tops) & ~mask
+    tops |= _open_tops(field, likelihood, mask | tops)
     likelihood = np.where(tops, np.float32(ODDS), likelihood)
     return GroundShadows(visibility.astype(np.float32), dark, likelihood, mask | tops)
 

@@ -57,7 +57,7 @@ def view_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack |
     low = _low_contrast(_contrasts(view))
     seen = [_usual_slope(one, steady) for one in shown]
     moved, limits = _moved_photos(home, [not slope < SAME_VIEW for slope in seen], steady)
-    sharpness = edge_sharpness(stack.rgb[list(indices)])
+    sharpness = edge_sharpness(view.brightness)
     found = []
     for k, i in enumerate(indices):
         path = stack.paths[i]

@@ -1,10 +1,10 @@
 """How sharp each photo's edges are: shake shows without texture, too, on plain tables and along the grain of wood."""
 
-import warnings
-
 import cv2
 import numpy as np
 from jaxtyping import Float
+
+from capture.checks.robust import column_quantile
 
 SIDE = 640  # px: the long side of the pictures that are looked at; those much smaller than that show no shake
 LEAST_SIDE = 480
@@ -18,28 +18,26 @@ SOFTEST = 2  # ways that are asked: shake smears the edges across one way, and s
 SMEARED = 0.76  # of the usual; shaken photos gave 0.58 to 0.75 (32 of 32), good ones 0.77 and more (all but 4 of 327)
 
 
-def edge_sharpness(rgb: Float[np.ndarray, "photos height width 3"]) -> Float[np.ndarray, " photos"]:
+def edge_sharpness(brightness: list[Float[np.ndarray, "height width"]]) -> Float[np.ndarray, " photos"]:
     """Return how steep the sharpest edges of each photo are, over the usual, across the ways in which they are softest.
 
     Steep: the step of log brightness over two pixels, as a share of that across the whole edge. NaN where too few edges
     lie across two ways, and for pictures too small to show it.
 
     Args:
-        rgb: linear brightness, one camera.
+        brightness: linear, of photos by one camera.
     """
-    size = max(rgb.shape[1:3])
-    if size < LEAST_SIDE or not len(rgb):
-        return np.full(len(rgb), np.nan)
-    steep = np.array([_steepness(one, min(SIDE / size, 1.0)) for one in rgb])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a way in which no photo shows enough
-        relative = steep / np.nanmedian(steep, axis=0)
+    size = max(brightness[0].shape)
+    if size < LEAST_SIDE:
+        return np.full(len(brightness), np.nan)
+    steep = np.array([_steepness(one, min(SIDE / size, 1.0)) for one in brightness])
+    relative = steep / column_quantile(steep, 0.5)
     return np.sort(relative, axis=1)[:, :SOFTEST].mean(1)
 
 
-def _steepness(rgb: Float[np.ndarray, "height width 3"], scale: float) -> Float[np.ndarray, " ways"]:
+def _steepness(brightness: Float[np.ndarray, "height width"], scale: float) -> Float[np.ndarray, " ways"]:
     """Return the steepness of the sharpest edges across each way; NaN where there are too few."""
-    grey = cv2.resize(rgb.mean(2).astype(np.float32), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    grey = cv2.resize(brightness.astype(np.float32), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     grey = np.maximum(grey, 0) / max(float(np.percentile(grey, 99)), 1e-9)
     picture = np.log(grey ** (1 / 2.2) + DARKEST)
     inner = tuple(slice(STRAIGHT + 1, n - STRAIGHT - 1) for n in picture.shape)
