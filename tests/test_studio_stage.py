@@ -86,8 +86,10 @@ def test_a_note_made_in_the_studio_is_kept_with_the_run_and_goes_with_its_export
         tab.on("pageerror", lambda error: said.append(str(error)))
         tab.goto(f"{address}/#/run/{'runs%2Fheap'}")
         frame = tab.frame_locator("iframe.result")
+        tab.focus("section.save select")  # before the stage is there
         frame.locator("summary:has-text('Notes and views')").wait_for(state="attached")
         wait_until(tab, lambda: frame.locator("#first").count() == 0)  # the page's own picture has taken its place
+        assert tab.evaluate("document.activeElement.tagName") == "SELECT"  # and leaves the keys to whoever has them
         frame.locator("summary:has-text('Notes and views')").press("Enter")
         frame.locator("#save-view").press("Enter")
         wait_until(tab, lambda: (run / "stage.json").exists())

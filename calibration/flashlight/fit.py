@@ -292,7 +292,8 @@ def photo_quality(fit: FlashlightFit):
     residual = np.array([spread(s[m]) if m.any() else np.inf for s, m in zip(size, known, strict=True)])
     follows = (fit.weight > 0.1 * fit.evidence.weight) & known
     share = follows.sum(1) / max(int(ground.sum()), 1)
-    return residual / max(float(np.median(residual)), 1e-6), share
+    seen = residual[np.isfinite(residual)]
+    return residual / max(float(np.median(seen)) if seen.size else 0.0, 1e-6), share
 
 
 def does_not_follow(fit: FlashlightFit) -> Bool[np.ndarray, " photos"]:

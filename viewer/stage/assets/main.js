@@ -81,7 +81,7 @@ async function begin() {
   startRenderer(linesInSpace, () => byId("first").remove());
   drawBar();
   drawNotes(true);
-  canvas.focus({ preventScroll: true });
+  if (window === window.top) canvas.focus({ preventScroll: true });  // in a frame the keys may belong to the page around it
 }
 
 // For whoever embeds the page: where camera and lamp are (radians and the scene's unit), and how to move them.
