@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from ball_shadows import EYE, RADIUS, drawn
 
-from calibration.flashlight import common_motion, outline_lights
-from calibration.flashlight.fit import FlashlightFit, does_not_follow
+from calibration.flashlight import beam_aims, common_motion, outline_lights
+from calibration.flashlight.fit import FlashlightFit, does_not_follow, may_be_misplaced
 from calibration.flashlight.light_estimate import AMBIGUOUS, told_doubt
 from calibration.flashlight.model import Evidence, Flashlights, free_tangent, log_irradiance
 from calibration.lights.ground_cells import GroundCells
@@ -85,6 +85,21 @@ def _with_one_lost(maps, lights: np.ndarray, k: int) -> tuple[FlashlightFit, Evi
     state = Flashlights(places, 0 * places, np.zeros(len(lights)), beam, 0.0, np.zeros(3))
     weight = evidence.weight * (np.arange(len(lights)) != k)[:, None]
     return FlashlightFit(state, evidence, weight, common_motion.LOOSE, free_tangent), evidence
+
+
+def test_a_light_whose_beam_misses_where_all_aim_is_in_doubt(ball):
+    """The beams miss by some 4 degrees; one points 500 mm beside, though its light is where it was."""
+    _, lights, maps = ball
+    evidence = _shaded(maps, lights)
+    aims = 30 * np.random.default_rng(5).standard_normal(lights.shape) * [1, 1, 0]
+    aims[4] += [300, 400, 0]
+    state = Flashlights(lights, aims, np.zeros(len(lights)), np.array([3.0, 0, 0, 0]), 0.0, np.zeros(3))
+    fit = FlashlightFit(state, evidence, evidence.weight, common_motion.LOOSE, free_tangent)
+    others = np.delete(np.arange(len(lights)), 4)
+    assert beam_aims.in_doubt(fit)[4]
+    straight = replace(fit, flashlights=replace(state, targets=0 * aims))
+    assert not (beam_aims.in_doubt(fit) & ~may_be_misplaced(fit))[others].any()
+    np.testing.assert_array_equal(beam_aims.in_doubt(straight), may_be_misplaced(straight))
 
 
 def test_a_pass_begins_with_a_light_that_misfits_where_its_shading_puts_it(ball):

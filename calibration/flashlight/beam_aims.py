@@ -4,15 +4,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from calibration.flashlight.fit import hemisphere, misfits
+from calibration.flashlight.fit import FlashlightFit, hemisphere, may_be_misplaced, misfits
 from calibration.flashlight.model import Evidence, Flashlights, Samples, across, cell_residuals, log_irradiance
 
 OFF_AXIS = tuple(np.radians([0.0, 7.0, 14.0, 21.0, 28.0, 35.0]))  # of the rings of trial axes, from where people aim
 PER_RING = 6  # trial axes on the first ring; the others have as many more
 EVERY = 3  # of the ground's cells: many, to tell two aims apart
 CLEARLY = 0.9  # of the residual with the present aim: better aims are taken
+ELSEWHERE = 2.0  # times the usual angle between a beam and the way to where all aim
+STEADY = 0.1  # rad, of that angle: hands aim no better
 
 
 def looked_for_aims(
@@ -37,6 +39,17 @@ def looked_for_aims(
         if size[best] < CLEARLY * size[0]:
             targets[k], power[k] = trials[best], offset[best]
     return replace(flashlights, targets=targets, log_power=power)
+
+
+def in_doubt(fit: FlashlightFit) -> Bool[np.ndarray, " photos"]:
+    """Return which photos misfit, or have a beam that misses where all aim by twice the usual angle.
+
+    From half its distance, aimed past the ground, a light may shine on it as from its true place.
+    """
+    away = fit.flashlights.aim - fit.flashlights.positions
+    cosine = (away * fit.flashlights.axes()).sum(1) / np.linalg.norm(away, axis=1)
+    angle = np.arccos(np.clip(cosine, -1, 1))
+    return may_be_misplaced(fit) | (angle > ELSEWHERE * max(float(np.median(angle)), STEADY))
 
 
 def places_by_shading(

@@ -13,7 +13,7 @@ from operator import itemgetter
 import numpy as np
 from jaxtyping import Bool, Float
 
-from calibration.flashlight.beam_aims import looked_for_aims, places_by_shading
+from calibration.flashlight.beam_aims import in_doubt, looked_for_aims, places_by_shading
 from calibration.flashlight.common_motion import (
     CONTRASTS,
     LOOSE,
@@ -27,7 +27,6 @@ from calibration.flashlight.fit import (
     NEAR,
     FlashlightFit,
     does_not_follow,
-    may_be_misplaced,
 )
 from calibration.flashlight.model import (
     PER_FLASHLIGHT,
@@ -64,7 +63,6 @@ OUTLINES_WRONG = 1 / 3  # of the trusted photos at odds: more than are ever bad,
 REPAIRED = 0.5  # ... and its hull is right if it leaves less than this share of them at odds
 LEAST_SHADOWS = 0.5  # of the photos that must show a shadow
 ROUNDED = 0.03  # of the range: what neither outlines nor shading show
-HONEST = 1.7  # errors over formal sigmas on rendered captures, at most: a motion that all lights share is not all seen
 
 
 def with_outlines(
@@ -184,12 +182,12 @@ def _with_strays(
 ) -> FlashlightFit:
     """Locate the photos whose shadows are cut, or contradict the others, once these are known; refit all together.
 
-    So are those whose shading misfits: a shadow may agree with the others from a wrong place. Tried for each: where
-    outlines alone put it, where shading alone did, and where it does now, with albedo, beam and power of the others;
-    outlines and shading together decide.
+    So are those whose shading misfits, or whose beam points elsewhere than the others': a shadow may agree with the
+    others from a wrong place. Tried for each: where outlines alone put it, where shading alone did, and where it does
+    now, with albedo, beam and power of the others; outlines and shading together decide.
     """
     assert fit.evidence.outlines is not None
-    strays = ~whole | _is_stray(fit.evidence.outlines, fit.flashlights.positions) | may_be_misplaced(fit)
+    strays = ~whole | _is_stray(fit.evidence.outlines, fit.flashlights.positions) | in_doubt(fit)
     for _ in range(ROUNDS):
         if not strays.any():
             break
@@ -298,7 +296,7 @@ def outline_sigma(fit: FlashlightFit) -> Float[np.ndarray, "photos 3"]:
     n, own = len(fit.flashlights.positions), fit.flashlights.per_flashlight()
     variance = np.diag(covariance)[: own * n].reshape(n, own)[:, :3]
     reach = np.linalg.norm(fit.flashlights.positions - fit.evidence.cells.centre, axis=1, keepdims=True)
-    return np.sqrt(HONEST**2 * (np.maximum(variance, 0) + (ROUNDED * reach) ** 2 / 3) + fit.between)
+    return np.sqrt(np.maximum(variance, 0) + (ROUNDED * reach) ** 2 / 3 + fit.between)
 
 
 def _lit_cells(evidence: Evidence, shadows: GroundShadows, posed_camera: PosedCamera) -> Evidence:

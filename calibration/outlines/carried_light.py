@@ -15,7 +15,7 @@ from calibration.pose import Pose
 USUAL_MM = np.array([18.0, 18.0, 5.0])  # one sigma of the offset before a photo was seen: on the same back
 BLURS = (8.0, 5.0, 3.0, 2.0, 1.4, 1.0, 1.0)  # factors of an outline's sigma, one after the other
 STEPS = 6  # with each
-HONEST = 1.7  # errors over formal sigmas, as of lights from outlines
+HONEST = 1.7  # errors over formal sigmas: outlines of one series err alike, and three numbers answer for all of them
 ROUGH_MM = 2.0  # between small minima of the outlines' cost
 
 
