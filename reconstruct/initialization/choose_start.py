@@ -11,14 +11,14 @@ from torch import Tensor
 
 from capture.errors import ReconstructionError
 from reconstruct.config import FitConfig, Level
+from reconstruct.initialization.bent_hull import JUDGES_BLOCK, JUDGES_SEED, JUDGES_SHARE, BentHull, Say
 from reconstruct.initialization.height_field import HeightConfig, beside_nothing, fit_heights
 from reconstruct.initialization.height_grid import base_of, height_grid
 from reconstruct.initialization.height_view import height_view
-from reconstruct.initialization.hull_front import on_front
 from reconstruct.initialization.light_contradictions import contradictions
-from reconstruct.initialization.normal_integration import BIAS, LIT_BIAS, follow_normals
+from reconstruct.initialization.normal_integration import follow_normals, integrate_normals, normals_bias
 from reconstruct.initialization.shading_start import heights_from_shading
-from reconstruct.initialization.shadow_hull import LIGHTS_PER_NEED, GroundMaps, carved
+from reconstruct.initialization.shadow_hull import GroundMaps, carved
 from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out, without
 from reconstruct.labels.labels import Labels, not_isolated
 from reconstruct.labels.multiple_lights import is_shared
@@ -33,9 +33,6 @@ FEW_WRONG = 0.1  # wrong votes per node from given shadow pictures; above, one w
 LIGHTS_PER_VOTE = 8  # a second vote costs completeness: it must be affordable
 FEWEST_BARE = 0.02  # of the picture: less bare ground than this bounds no hull
 FEWEST_LIGHTS = 4  # three for a pixel's albedo and normal, and one to detect a shadow
-SHADING_ROUNDS = 4  # of estimating the normals on a hull and moving it to their integral, at most
-LIT_ROUNDS = 2  # the same from the lights that reach each pixel of shadow pictures
-SETTLED = 0.5  # voxels: a median move too small to recompute the labels
 SURE = 0.5  # confidence from which a pixel is known to be bare
 BOTH_AGREE = (48, 96, 192)  # px of the longer side in which normals and shadows are brought to agree, in turn
 NODES_PER_PIXEL = 1.75  # along the picture: finer than a pixel, so that normals keep what a pixel can show
@@ -44,17 +41,10 @@ ITERATIONS = 12  # of the free surface: measured, the error of held-out rays ris
 RATE = (0.1, 0.05)  # voxels: the height field is right to about a voxel already
 SHARPNESS = (8.0, 25.0)  # per voxel, for the same reason not from 4
 HULL, LIT_HULL = "shadow hull", "shadow hull, bent to the lights that reach it"  # names of starts, in checkpoints
-JUDGES_SEED = 1  # beside the seed, for the rays that judge the two surfaces: others than those that a level holds out
-# Single pixels, px and share of them: judged in blocks, at a lower sharpness, a relief lost a degree.
-JUDGES_BLOCK, JUDGES_SHARE = 1, 0.05
-CLEARLY = 0.85  # of the hull's shadow error: one made anew, or bent to lit pixels, is taken below it; .79 was better
 JUDGES_SHARPNESS = 25.0  # NeuS s per voxel, as at the end of the solve
 CURVATURE = 0.1  # of the step size: the height field is smooth already
 
-Say = Callable[[str], None]  # takes a sentence about the step that begins
 Show = Callable[[SdfGrid], None]  # takes a surface that is to be improved
-Seen = tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]  # see Observer.seen
-Bend = Callable[[SdfGrid, Seen, Labels], tuple[SdfGrid, float]]  # the surface bent, and its median move, voxels
 Judge = Callable[[Scene, FitConfig], bool]  # whether a hull suits shadow pictures with a mask better than heights
 
 
@@ -174,51 +164,10 @@ class HullStart:
         scene, _ = views[0]
         if scene.ground_depth is None and not (bool(scene.light_sigma.any()) or is_shared(scene)):
             self._doubts = _doubts(scene, ground_labels[0], found.maps)  # these maps are made once
-        return self._bent(hull, resampled(found.space, nodes).grid(), *views[0])
-
-    def _bent(self, hull: SdfGrid, space: SdfGrid, scene: Scene, observer: Observer) -> SdfGrid:
-        """Return the hull bent to the normals that one camera sees; `space` is what nothing proves empty.
-
-        The hull of several views is tight, and nothing ties the depth of one view's integral to what the others see:
-        bent by each in turn, a head of 50 mm became hollow. Under few lights the hull is bent as it is, and made anew
-        behind the integral of the normals; the shadows on the ground decide, in doubt for the first. Shreds of an ear
-        had an error of .016, the ear anew .013; a head before a body had .012, drawn to the body .039. Likewise for the
-        normals of shadow pictures: a dome over a flat top had an error of .095, bent .062; a round body .033 and .030.
-        """
-        kept = self._rounds(
-            hull, scene, observer, lambda now, seen, own: follow_normals(now, scene, *seen, own, True, _bias(scene))
-        )
-        if scene.rgb is None:
-            errors = [self._shadow_error(grid, scene, observer) for grid in (hull, kept)]
-            self.name = LIT_HULL if errors[1] < CLEARLY * errors[0] else HULL
-            return kept if self.name == LIT_HULL else hull
-        if len(scene.lights) >= LIGHTS_PER_NEED:
-            return kept
-        first = observer.seen(space)[0]
-        anew = self._rounds(hull, scene, observer, lambda _, seen, own: on_front(hull, space, scene, seen, first, own))
-        errors = [self._shadow_error(grid, scene, observer) for grid in (kept, anew)]
-        return anew if errors[1] < CLEARLY * errors[0] else kept
-
-    def _rounds(self, hull: SdfGrid, scene: Scene, observer: Observer, bent: Bend) -> SdfGrid:
-        """Return the hull after rounds of reading the normals on it and bending it to them."""
-        labels, rounds = observer.labels(hull, scene), SHADING_ROUNDS if scene.rgb is not None else LIT_ROUNDS
-        for number in range(rounds):
-            self._say(f"bending the hull to the normals that the photos show, round {number + 1} of at most {rounds}")
-            if number and scene.rgb is not None:
-                labels = observer.labels(hull, scene)
-            labels = observer.with_normals(labels, hull, scene)
-            hull, moved = bent(hull, observer.seen(hull), labels)
-            hull = resampled(hull, self.config.levels[0].nodes).grid()
-            if moved < SETTLED:
-                break
-        return hull
-
-    def _shadow_error(self, grid: SdfGrid, scene: Scene, observer: Observer) -> float:
-        """Return the mean error of the shadows on the ground, which no bending has used, over some of the pixels."""
-        rays = supervise(scene, observer.ground_labels())
-        width, count = scene.camera.width, len(scene.lights)
-        drawn = draw_blocks(rays.pixels, width, count, (self.config.seed, JUDGES_SEED), JUDGES_BLOCK, JUDGES_SHARE)
-        return hold_out(rays, drawn)[1].error(grid, scene)
+        bent = BentHull(*views[0], self.config, self._say).found(hull, resampled(found.space, nodes).grid())
+        if views[0][0].rgb is None and bent is not hull:
+            self.name = LIT_HULL
+        return bent
 
     def standing(self, scenes: Scenes, start: SdfGrid) -> Scenes:
         """Return the scenes themselves: their ground is known."""
@@ -232,12 +181,12 @@ class HullStart:
     def shaped(self, surface: SdfGrid, scenes: Scenes, labels: tuple[Labels, ...]) -> SdfGrid:
         """Return the surface moved to the integral of the labels' normals, where there are any.
 
-        Not with several views, see `_bent`: behind an edge that one of them looks past, a chest became 8 mm hollow.
+        Not with several views, see `bent_hull`: behind an edge that one of them looks past, a chest became 8 mm hollow.
         """
         if len(scenes) > 1:
             return surface
         scene, observer, own = next(zip(scenes, self._observers, labels, strict=True))
-        return follow_normals(surface, scene, *observer.seen(surface), own, bias=_bias(scene))[0]
+        return follow_normals(surface, scene, *observer.seen(surface), own, integrate_normals, normals_bias(scene))
 
     def better(self, start: SdfGrid, found: SdfGrid, scenes: Scenes) -> SdfGrid:
         """Return the found surface: the hull is never better."""
@@ -257,11 +206,6 @@ def _doubts(scene: Scene, labels: Labels, maps: GroundMaps | None = None) -> tup
     """Return the contradictions between the shadows on the ground in one view, see `contradictions`."""
     of = f"{scene.view}: " if scene.view else ""
     return tuple(of + doubt for doubt in contradictions(scene, labels, maps).sentences())
-
-
-def _bias(scene: Scene) -> float:
-    """Return the common error of a side's normals, rad: from shading, or from which lights reach a pixel."""
-    return BIAS if scene.rgb is not None else LIT_BIAS
 
 
 def _votes(scenes: Scenes) -> int:
@@ -380,7 +324,7 @@ class ShadingStart(HeightStart):
             surface = height_grid(field, self._scene, self._nodes)
         self._say("following the normals at full size")
         (labels,) = self.labels(surface, (self._scene,))
-        surface = follow_normals(surface, self._scene, *self._observer.seen(surface), labels)[0]
+        surface = follow_normals(surface, self._scene, *self._observer.seen(surface), labels, integrate_normals)
         return self.better(start, resampled(surface, self._nodes).grid(), (self._scene,))
 
 

@@ -29,8 +29,8 @@ def on_front(
     seen: tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]],
     first: Float[Tensor, "height width 3"],
     labels: Labels,
-) -> tuple[SdfGrid, float]:
-    """Return the hull behind the integral of the labels' normals; also the median move, voxels.
+) -> SdfGrid:
+    """Return the hull behind the integral of the labels' normals.
 
     Args:
         hull: as it was carved.
@@ -43,11 +43,10 @@ def on_front(
     """
     some = some_pixels(scene, *seen, labels)
     if some is None:
-        return hull, 0.0
+        return hull
     front = (first - scene.eye).norm(dim=-1)[:: some.step, :: some.step].numpy().astype(np.float64)
     depth = integrate_normals(some.rays, some.before, some.own, some.normals, some.trust, True, front)
-    moved = float(np.nanmedian(np.abs(depth - some.before))) / hull.spacing
-    return _behind(depth, some, hull, space, scene), moved
+    return _behind(depth, some, hull, space, scene)
 
 
 def _behind(

@@ -4,6 +4,7 @@ A ray constrains one point of the surface, and its effect spreads by a few voxel
 therefore stays the dome of the shadow hull, though every normal on it is known. Its depth is the normals' integral.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -24,6 +25,8 @@ BREAK = 2.0  # pixels between the tangent planes of neighbours that are on diffe
 GUESSED = 2 * BREAK  # pixels of empty space before a depth that is a guess: its breaks are guesses, too
 GUESSED_WIDTHS = (np.inf, 30.0, 9.0)  # of BREAK, for pairs with such a depth, in rounds before the others
 TOUCHING = 10.0  # times heavier when in front of a bound, where nothing can be, than behind it
+OUTSIDE = 1000.0  # of the usual tie, in front of a hull that shadows carved; and where the surface touches that hull
+LIKE_HULL = 0.9  # cosine between the normals of hull and shading above which the surface may touch the hull
 WRONG_BOUNDS = 0.05  # share of a hull's pixels that are behind the truth: edges, and beside thin matter that was lost
 HELD_FROM, HELD_ROUNDS = 32.0, 8  # pixels below which an error counts squared, at first; halved in each round, to 1
 GRAZING = 0.5  # cosine between ray and normal below which a normal says less of depth
@@ -34,11 +37,14 @@ MOST_PIXELS = 20_000  # solved for at once; more are skipped evenly: only long d
 DIRECT_PIXELS = 2 * MOST_PIXELS  # factorised in half a second
 CG_STEPS, CG_RESIDUAL = 150, 1e-9  # a wave of a hundred pixels settles in as many steps
 FEWEST_PIXELS = 9
+DUST = 1e-6
 BIAS = np.radians(1.5)  # of normals: common error of a whole side by highlights and interreflection
 LIT_BIAS = np.radians(4.0)  # the same of normals that are read from which lights reach a pixel
 SEEN = 0.3  # of the pixels about a node's must show the object for it to move
 ABOUT = 4.0  # voxels before and behind the surface in which nodes move
 MOST_OF_DEPTH = 0.8  # of the matter along a ray may be taken from its front
+
+Integrate = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # as integrate_normals
 
 
 def follow_normals(
@@ -47,34 +53,38 @@ def follow_normals(
     points: Float[Tensor, "height width 3"],
     own: Float[Tensor, "height width 3"],
     labels: Labels,
-    bounds: bool = False,
+    integrate: Integrate,
     bias: float = BIAS,
-) -> tuple[SdfGrid, float]:
+) -> SdfGrid:
     """Move the grid's visible side to the integral of the labels' normals.
 
     Args:
         points: world, where each pixel's ray meets the grid's surface or the ground.
         own: world, the surface's normals there; 0 on the ground.
-        bounds: the surface is a shadow hull: the object is never in front of it. See `integrate_behind`.
+        integrate: what is known of the surface so far: `integrate_normals`, or that it is a shadow hull, which the
+            object is never in front of.
         bias: rad, of the labels' normals: their integral does not move what it explains.
 
     Returns:
-        The grid and its median move, voxels. Where it was moved, only its sign is right: it is no longer a distance.
+        The grid. Where it was moved, only its sign is right: it is no longer a distance.
     """
     some = some_pixels(scene, points, own, labels)
     if some is None:
-        return grid, 0.0
+        return grid
     before, rays, seen = some.before, some.rays, np.isfinite(some.before)
     given = (rays, before, some.own, some.normals, some.trust)
-    is_lit = bounds and scene.rgb is None  # behind the hull of five photos in colour a figure's depth error doubled
-    after = integrate_behind(*given) if is_lit else integrate_normals(*given, bounds)
+    after = integrate(*given)
     after = before + _beyond_bias(after - before, before, rays, bias)
     part = (slice(None, None, some.step), slice(None, None, some.step))
     shown = torch.from_numpy(seen)
-    matter = _matter_behind(grid, points[part][shown], scene.directions[part][shown])
+    matter = _matter_behind(grid, points[part][shown], scene.directions[part][shown], scene.ground_height)
     after[seen] = np.minimum(after[seen], before[seen] + MOST_OF_DEPTH * matter)
-    moved = float(np.median(np.abs(after - before)[seen])) / grid.spacing
-    return _with_front(grid, scene, before, after, some.step), moved
+    return _with_front(grid, scene, before, after, some.step)
+
+
+def normals_bias(scene: Scene) -> float:
+    """Return the common error of a side's normals, rad: from shading, or from which lights reach a pixel."""
+    return BIAS if scene.rgb is not None else LIT_BIAS
 
 
 @dataclass(frozen=True)
@@ -145,6 +155,37 @@ def integrate_normals(
     for wider in (*(GUESSED_WIDTHS if guess.any() else ()), *(1.0 for _ in range(ROUNDS))):
         hold = tie * np.where(t < first, TOUCHING if bounds else 1.0, 1.0)
         t = _reweighted(chords.slope, apart, weight, BREAK * np.where(guessed, wider, 1.0), hold, t0, t)
+    return _spread(t, where)
+
+
+def integrate_within(
+    rays: Float[np.ndarray, "height width 3"],
+    hull: Float[np.ndarray, "height width"],
+    own: Float[np.ndarray, "height width 3"],
+    normals: Float[np.ndarray, "height width 3"],
+    trust: Float[np.ndarray, "height width"],
+) -> Float[np.ndarray, "height width"]:
+    """Solve for ray lengths t, so that the surface t * ray has the given normals and lies in a shadow hull.
+
+    Two surfaces that touch have one normal there. So the hull is the surface, to a pixel, where shading tells the
+    hull's own normal; elsewhere it lies in front of the surface by no one knows what: over a bowl it is a lid. Held to
+    the lid as to an outline, the bottom of a bowl came half way up. Since breaks of the hull are not the surface's, as
+    at the bowl's front rim, pairs begin without robust weights, which then narrow, as in `integrate_normals`.
+
+    Args:
+        hull: t of the hull; nan where there is none.
+        own: its normals, which are used where the given ones are not trusted.
+    """
+    where = np.isfinite(hull)
+    t0 = t = hull[where]
+    chords = _chords(rays, hull, own, normals, trust)
+    cosine = (own * normals).sum(-1)[where]
+    touching = trust[where] * np.clip((cosine - LIKE_HULL) / (1 - LIKE_HULL), DUST, 1)
+    tie = OUTSIDE * _tie(where, 0)[where] / chords.size**2
+    for wider in (*GUESSED_WIDTHS, *(1.0 for _ in range(ROUNDS))):
+        width = wider * BREAK
+        hold = tie * np.where(t < t0, 1, touching / (1 + ((t - t0) / (width * chords.size)) ** 2) ** 2 + DUST)
+        t = _reweighted(chords.slope, np.zeros_like(chords.apart), chords.weight, width, hold, t0, t)
     return _spread(t, where)
 
 
@@ -297,11 +338,15 @@ def _neighbours(where: Bool[np.ndarray, "height width"]) -> tuple[Int[np.ndarray
     return np.concatenate(first), np.concatenate(second)
 
 
-def _matter_behind(grid: SdfGrid, points: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Return the world length of matter along rays behind points on the surface."""
+def _matter_behind(
+    grid: SdfGrid, points: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"], ground_height: float
+) -> Float[np.ndarray, " n"]:
+    """Return the world length of matter along rays behind points on the surface: to its end, or to the ground."""
     hollow = SdfGrid(-grid.values, grid.origin, grid.spacing)
     inside = points + 0.5 * grid.spacing * rays
-    return find_surface(hollow, inside.contiguous(), rays.contiguous()).nan_to_num(posinf=0.0).double().numpy()
+    ends = find_surface(hollow, inside.contiguous(), rays.contiguous())
+    down = (ground_height - points[:, 2]).clamp(max=0) / rays[:, 2].clamp(max=-DUST)
+    return torch.where(ends.isfinite(), ends, torch.where(rays[:, 2] < 0, down, 0.0)).double().numpy()
 
 
 def _with_front(
