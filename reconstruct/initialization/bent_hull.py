@@ -55,6 +55,15 @@ Bend = Callable[[SdfGrid, Seen, Labels], SdfGrid]  # bends the surface
 
 
 @dataclass(frozen=True)
+class _Begin:
+    """What all ways to bend begin with."""
+
+    hull: SdfGrid
+    seen: Seen
+    labels: Labels  # read on it, with normals
+
+
+@dataclass(frozen=True)
 class BentHull:
     """What bends the hull of one scene."""
 
@@ -70,15 +79,17 @@ class BentHull:
             hull: on the first level's grid.
             space: that nothing proves empty.
         """
-        scene = self.scene
+        scene, observer = self.scene, self.observer
+        read, side = observer.labels(hull, scene), observer.seen(hull)
+        begin = _Begin(hull, side, observer.with_normals(read, hull, scene))
         if scene.rgb is None:
-            return self._better(hull, self._rounds(hull, self._along(integrate_behind)))
-        tied = self._rounds(hull, self._along(partial(integrate_normals, bounds=True)))
-        kept = self._better(tied, self._rounds(hull, self._along(integrate_within, (hull, self.observer.seen(hull)))))
+            return self._better(hull, self._rounds(begin, self._along(integrate_behind)))
+        tied = self._rounds(begin, self._along(partial(integrate_normals, bounds=True)))
+        kept = self._better(tied, self._rounds(begin, self._along(integrate_within, (hull, side))))
         if len(scene.lights) >= LIGHTS_PER_NEED:
             return kept
-        first = self.observer.seen(space)[0]
-        anew = self._rounds(hull, lambda _, seen, labels: on_front(hull, space, scene, seen, first, labels))
+        first = observer.seen(space)[0]
+        anew = self._rounds(begin, lambda _, seen, labels: on_front(hull, space, scene, seen, first, labels))
         return self._better(kept, anew)
 
     def _along(self, integrate: Integrate, fixed: tuple[SdfGrid, Seen] | None = None) -> Bend:
@@ -90,16 +101,16 @@ class BentHull:
 
         return bend
 
-    def _rounds(self, hull: SdfGrid, bent: Bend) -> SdfGrid:
+    def _rounds(self, begin: _Begin, bent: Bend) -> SdfGrid:
         """Return the hull after rounds of reading the normals on it and bending it to them."""
         scene, observer = self.scene, self.observer
-        labels, rounds = observer.labels(hull, scene), SHADING_ROUNDS if scene.rgb is not None else LIT_ROUNDS
-        seen = observer.seen(hull)
+        rounds = SHADING_ROUNDS if scene.rgb is not None else LIT_ROUNDS
+        hull, seen, labels = begin.hull, begin.seen, begin.labels
         for number in range(rounds):
             self.say(f"bending the hull to the normals that the photos show, round {number + 1} of at most {rounds}")
-            if number and scene.rgb is not None:
-                labels = observer.labels(hull, scene)
-            labels = observer.with_normals(labels, hull, scene)
+            if number:
+                labels = labels if scene.rgb is None else observer.labels(hull, scene)
+                labels = observer.with_normals(labels, hull, scene)
             hull = resampled(bent(hull, seen, labels), self.config.levels[0].nodes).grid()
             before, seen = seen, observer.seen(hull)
             shown = (before[1] != 0).any(-1) & (seen[1] != 0).any(-1)
