@@ -116,14 +116,17 @@ def test_a_hollow_lies_below_the_lid_that_a_hull_puts_on_it(block):
     assert within[beside].mean() < 0.3 * PIXEL < 3 * PIXEL < tied[beside].mean()
 
 
-def test_matter_above_the_ground_ends_there(block):
+def test_matter_ends_where_its_surface_does_or_at_the_ground(block):
+    """One ray goes down through the block, which stands on the ground; one across it, level, and meets no ground."""
     scene, truth = block
     low = torch.tensor([-60.0, -45.0, 0.0])
     at = torch.stack(torch.meshgrid(*(torch.arange(n) for n in (41, 31, 21)), indexing="ij"), -1) * 3.0 + low
     values = torch.from_numpy(truth.sdf(at.reshape(-1, 3).numpy().astype(float))).float().reshape(at.shape[:3])
-    top, down = torch.tensor([[0.0, 0.0, 40.0]]), torch.tensor([[0.6, 0.0, -0.8]])
-    found = _matter_behind(SdfGrid(values, low, 3.0), top, down, scene.ground_height)
-    np.testing.assert_allclose(found, 50.0, atol=3.0)
+    points = torch.tensor([[0.0, 0.0, 40.0], [-45.0, 0.0, 20.0]])
+    rays = torch.tensor([[0.6, 0.0, -0.8], [1.0, 0.0, 0.0]])
+    to_ground = torch.tensor([(40.0 - scene.ground_height) / 0.8, torch.nan])
+    found = _matter_behind(SdfGrid(values, low, 3.0), points, rays, to_ground)
+    np.testing.assert_allclose(found, [50.0, 90.0], atol=3.0)
 
 
 def test_what_is_in_front_of_a_hull_weighs_more(block):

@@ -15,7 +15,7 @@ Likewise for the normals of shadow pictures, `integrate_behind`: a dome over a f
 a round body .033 and .030.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -47,20 +47,11 @@ SETTLED = 0.5  # voxels: a median move too small to recompute the labels
 JUDGES_SEED = 1  # beside the seed, for the rays that judge the two surfaces: others than those that a level holds out
 # Single pixels, px and share of them: judged in blocks, at a lower sharpness, a relief lost a degree.
 JUDGES_BLOCK, JUDGES_SHARE = 1, 0.05
-CLEARLY = 0.85  # of the first one's shadow error: another is taken below it; .79 was better
+CLEARLY = 0.85  # of the least shadow error before: another is taken below it; .79 was better
 
 Say = Callable[[str], None]  # takes a sentence about the step that begins
 Seen = tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]  # see Observer.seen
 Bend = Callable[[SdfGrid, Seen, Labels], SdfGrid]  # bends the surface
-
-
-@dataclass(frozen=True)
-class _Begin:
-    """What all ways to bend begin with."""
-
-    hull: SdfGrid
-    seen: Seen
-    labels: Labels  # read on it, with normals
 
 
 @dataclass(frozen=True)
@@ -80,17 +71,15 @@ class BentHull:
             space: that nothing proves empty.
         """
         scene, observer = self.scene, self.observer
-        read, side = observer.labels(hull, scene), observer.seen(hull)
-        begin = _Begin(hull, side, observer.with_normals(read, hull, scene))
+        side = observer.seen(hull)
+        read = observer.with_normals(observer.labels(hull, scene), hull, scene)
         if scene.rgb is None:
-            return self._better(hull, self._rounds(begin, self._along(integrate_behind)))
-        tied = self._rounds(begin, self._along(partial(integrate_normals, bounds=True)))
-        kept = self._better(tied, self._rounds(begin, self._along(integrate_within, (hull, side))))
-        if len(scene.lights) >= LIGHTS_PER_NEED:
-            return kept
-        first = observer.seen(space)[0]
-        anew = self._rounds(begin, lambda _, seen, labels: on_front(hull, space, scene, seen, first, labels))
-        return self._better(kept, anew)
+            return self._best([hull, self._rounds(hull, side, read, self._along(integrate_behind))])
+        bends = [self._along(partial(integrate_normals, bounds=True)), self._along(integrate_within, (hull, side))]
+        if len(scene.lights) < LIGHTS_PER_NEED:
+            first = observer.seen(space)[0]
+            bends.append(lambda _, seen, labels: on_front(hull, space, scene, seen, first, labels))
+        return self._best([self._rounds(hull, side, read, bend) for bend in bends])
 
     def _along(self, integrate: Integrate, fixed: tuple[SdfGrid, Seen] | None = None) -> Bend:
         """Return what bends the present surface, or always a fixed one, to the integral of the labels' normals."""
@@ -101,11 +90,15 @@ class BentHull:
 
         return bend
 
-    def _rounds(self, begin: _Begin, bent: Bend) -> SdfGrid:
-        """Return the hull after rounds of reading the normals on it and bending it to them."""
+    def _rounds(self, hull: SdfGrid, seen: Seen, labels: Labels, bent: Bend) -> SdfGrid:
+        """Return the hull after rounds of reading the normals on it and bending it to them.
+
+        Args:
+            seen: of the hull.
+            labels: as read on it, with normals.
+        """
         scene, observer = self.scene, self.observer
         rounds = SHADING_ROUNDS if scene.rgb is not None else LIT_ROUNDS
-        hull, seen, labels = begin.hull, begin.seen, begin.labels
         for number in range(rounds):
             self.say(f"bending the hull to the normals that the photos show, round {number + 1} of at most {rounds}")
             if number:
@@ -119,13 +112,15 @@ class BentHull:
                 break
         return hull
 
-    def _better(self, kept: SdfGrid, other: SdfGrid) -> SdfGrid:
-        errors = [self._shadow_error(grid) for grid in (kept, other)]
-        return other if errors[1] < CLEARLY * errors[0] else kept
-
-    def _shadow_error(self, grid: SdfGrid) -> float:
-        """Return the mean error of the shadows on the ground, which no bending has used, over some of the pixels."""
+    def _best(self, grids: Sequence[SdfGrid]) -> SdfGrid:
+        """Return the first grid, or a later one whose shadows on the ground, which no bending has used, err less."""
         rays = supervise(self.scene, self.observer.ground_labels())
         width, count = self.scene.camera.width, len(self.scene.lights)
         drawn = draw_blocks(rays.pixels, width, count, (self.config.seed, JUDGES_SEED), JUDGES_BLOCK, JUDGES_SHARE)
-        return hold_out(rays, drawn)[1].error(grid, self.scene)
+        judge = hold_out(rays, drawn)[1]
+        best, least = grids[0], judge.error(grids[0], self.scene)
+        for grid in grids[1:]:
+            error = judge.error(grid, self.scene)
+            if error < CLEARLY * least:
+                best, least = grid, error
+        return best

@@ -161,11 +161,11 @@ class HullStart:
         views = list(zip(self._scenes, self._observers, strict=True))
         if len(views) > 1:
             return hull
-        scene, _ = views[0]
+        scene, observer = views[0]
         if scene.ground_depth is None and not (bool(scene.light_sigma.any()) or is_shared(scene)):
             self._doubts = _doubts(scene, ground_labels[0], found.maps)  # these maps are made once
-        bent = BentHull(*views[0], self.config, self._say).found(hull, resampled(found.space, nodes).grid())
-        if views[0][0].rgb is None and bent is not hull:
+        bent = BentHull(scene, observer, self.config, self._say).found(hull, resampled(found.space, nodes).grid())
+        if scene.rgb is None and bent is not hull:
             self.name = LIT_HULL
         return bent
 

@@ -16,7 +16,7 @@ from scipy.sparse.linalg import cg, spsolve
 from torch import Tensor
 
 from reconstruct.labels.labels import Labels
-from reconstruct.scene import Scene
+from reconstruct.scene import Scene, ground_points
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface
 
@@ -37,7 +37,7 @@ MOST_PIXELS = 20_000  # solved for at once; more are skipped evenly: only long d
 DIRECT_PIXELS = 2 * MOST_PIXELS  # factorised in half a second
 CG_STEPS, CG_RESIDUAL = 150, 1e-9  # a wave of a hundred pixels settles in as many steps
 FEWEST_PIXELS = 9
-DUST = 1e-6
+DUST = 1e-6  # of a tie, or nothing would hold what no other pixel does
 BIAS = np.radians(1.5)  # of normals: common error of a whole side by highlights and interreflection
 LIT_BIAS = np.radians(4.0)  # the same of normals that are read from which lights reach a pixel
 SEEN = 0.3  # of the pixels about a node's must show the object for it to move
@@ -77,7 +77,8 @@ def follow_normals(
     after = before + _beyond_bias(after - before, before, rays, bias)
     part = (slice(None, None, some.step), slice(None, None, some.step))
     shown = torch.from_numpy(seen)
-    matter = _matter_behind(grid, points[part][shown], scene.directions[part][shown], scene.ground_height)
+    to_ground = (ground_points(scene) - points).norm(dim=-1)[part][shown]
+    matter = _matter_behind(grid, points[part][shown], scene.directions[part][shown], to_ground)
     after[seen] = np.minimum(after[seen], before[seen] + MOST_OF_DEPTH * matter)
     return _with_front(grid, scene, before, after, some.step)
 
@@ -184,7 +185,7 @@ def integrate_within(
     tie = OUTSIDE * _tie(where, 0)[where] / chords.size**2
     for wider in (*GUESSED_WIDTHS, *(1.0 for _ in range(ROUNDS))):
         width = wider * BREAK
-        hold = tie * np.where(t < t0, 1, touching / (1 + ((t - t0) / (width * chords.size)) ** 2) ** 2 + DUST)
+        hold = tie * np.where(t < t0, 1, touching * _geman_mcclure((t - t0) / (width * chords.size)) + DUST)
         t = _reweighted(chords.slope, np.zeros_like(chords.apart), chords.weight, width, hold, t0, t)
     return _spread(t, where)
 
@@ -275,9 +276,14 @@ def _reweighted(
     t: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:
     """Return t after a round of least squares with Geman-McClure weights of a width, and ties of `hold` to `held`."""
-    robust = weight / (1 + ((slope @ t - apart) / width) ** 2) ** 2
+    robust = weight * _geman_mcclure((slope @ t - apart) / width)
     matrix = slope.T @ diags(robust) @ slope + diags(hold)
     return _solved(csc_matrix(matrix), slope.T @ (robust * apart) + hold * held, t)
+
+
+def _geman_mcclure(error: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return the weights of errors in units of their width."""
+    return 1 / (1 + error**2) ** 2
 
 
 def _spread(t: Float[np.ndarray, " n"], where: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
@@ -339,14 +345,13 @@ def _neighbours(where: Bool[np.ndarray, "height width"]) -> tuple[Int[np.ndarray
 
 
 def _matter_behind(
-    grid: SdfGrid, points: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"], ground_height: float
+    grid: SdfGrid, points: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"], to_ground: Float[Tensor, " n"]
 ) -> Float[np.ndarray, " n"]:
     """Return the world length of matter along rays behind points on the surface: to its end, or to the ground."""
     hollow = SdfGrid(-grid.values, grid.origin, grid.spacing)
     inside = points + 0.5 * grid.spacing * rays
     ends = find_surface(hollow, inside.contiguous(), rays.contiguous())
-    down = (ground_height - points[:, 2]).clamp(max=0) / rays[:, 2].clamp(max=-DUST)
-    return torch.where(ends.isfinite(), ends, torch.where(rays[:, 2] < 0, down, 0.0)).double().numpy()
+    return torch.where(ends.isfinite(), ends, to_ground).nan_to_num(nan=0.0).double().numpy()
 
 
 def _with_front(
