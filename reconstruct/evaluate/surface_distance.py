@@ -16,6 +16,7 @@ ICP_STEPS = 25  # point to point, before point to plane
 ICP_PLANE_STEPS = 40
 ICP_SCALE_STEPS = 60  # point to point converges slowly when the scale is free
 ICP_POINTS = 20000  # more move the result by less than the surface's own noise
+ICP_HELD = 1e-3  # of what holds the best held motion, planes must hold one for it to be made
 ICP_SETTLED = 1e-8  # change of the mean distance at which it stops
 NEAREST_TRIANGLES = 6  # of a point's nearest samples; they contain the closest triangle, except at slivers
 TIE = 1e-6  # relative: triangles with distances this equal share the nearest edge or corner
@@ -104,11 +105,18 @@ def _onto_points(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"], with_
 def _onto_planes(
     a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> Similarity:
-    """Return the small rigid motion of a to the planes through b; linearised, damped (one plane leaves 3 DOF free)."""
+    """Return the small rigid motion of a to the planes through b; linearised.
+
+    Motions along which the planes hold nothing are left out: a ball would turn by the rounding of its pairs [Gelfand,
+    Ikemoto, Rusinkiewicz and Levoy, Geometrically Stable Sampling for the ICP Algorithm, 3DIM 2003].
+    """
     centre = a.mean(0)
-    j = np.c_[np.cross(a - centre, normals), normals]
-    x = np.linalg.solve(j.T @ j + 1e-9 * len(a) * np.eye(6), j.T @ ((b - a) * normals).sum(1))
-    rotation = Rotation.from_rotvec(x[:3]).as_matrix()
+    size = float(np.sqrt(((a - centre) ** 2).sum(1).mean()))  # so that a turn and a shift count alike
+    j = np.c_[np.cross((a - centre) / size, normals), normals]
+    value, motion = np.linalg.eigh(j.T @ j)
+    held = value > ICP_HELD * value[-1]
+    x = motion[:, held] @ ((j @ motion[:, held]).T @ ((b - a) * normals).sum(1) / value[held])
+    rotation = Rotation.from_rotvec(x[:3] / size).as_matrix()
     return Similarity(1.0, rotation, centre + x[3:] - rotation @ centre)
 
 
