@@ -13,7 +13,7 @@ from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.side_view import SideView
 from capture.errors import ReconstructionError
-from reconstruct.initialization.shadow_hull import shadow_hull
+from reconstruct.hull.shadow_hull import shadow_hull
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.sdf import carve_kernels
 

@@ -9,9 +9,10 @@ from brief_drafts import NORMAL_STEPS
 from scipy.ndimage import binary_erosion
 
 from reconstruct.config import FitConfig, Level
-from reconstruct.initialization import bent_hull, choose_start
-from reconstruct.initialization.hull_front import on_front
-from reconstruct.initialization.normal_integration import integrate_normals
+from reconstruct.hull import bent_hull
+from reconstruct.hull.hull_front import on_front
+from reconstruct.hull.normal_integration import integrate_normals
+from reconstruct.initialization import choose_start
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
 from reconstruct.sdf.grid import SdfGrid

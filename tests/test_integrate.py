@@ -7,13 +7,8 @@ import pytest
 import torch
 from scipy.ndimage import binary_erosion
 
-from reconstruct.initialization.normal_integration import (
-    _matter_behind,
-    follow_normals,
-    integrate_behind,
-    integrate_normals,
-    integrate_within,
-)
+from reconstruct.hull.follow_normals import _matter_behind, follow_normals
+from reconstruct.hull.normal_integration import integrate_behind, integrate_normals, integrate_within
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
 from reconstruct.sdf.grid import SdfGrid

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from synthetic import BALL, HEAP, Look, render
 
 from reconstruct.fields import Fields
+from reconstruct.hull.shadow_hull import carved
 from reconstruct.initialization import light_contradictions
 from reconstruct.initialization.light_contradictions import contradictions
-from reconstruct.initialization.shadow_hull import carved
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.run.report_json import misfit, pieces
 from reconstruct.sdf.grid import SdfGrid

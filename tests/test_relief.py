@@ -15,7 +15,7 @@ from test_solver import Listener
 from calibration.scenes.ground_depth import read_ground_depth
 from capture.errors import CalibrationError, CaptureError
 from reconstruct.config import FitConfig, Level
-from reconstruct.initialization.shadow_hull import shadow_hull
+from reconstruct.hull.shadow_hull import shadow_hull
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
 from reconstruct.mesh.mesh import extract_mesh

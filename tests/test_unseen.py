@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from synthetic import Box, Look, Sphere, render
 
-from reconstruct.initialization.shadow_hull import shadow_hull
+from reconstruct.hull.shadow_hull import shadow_hull
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import supervise
 from reconstruct.sdf.grid import SdfGrid

@@ -11,14 +11,15 @@ from torch import Tensor
 
 from capture.errors import ReconstructionError
 from reconstruct.config import FitConfig, Level
-from reconstruct.initialization.bent_hull import JUDGES_BLOCK, JUDGES_SEED, JUDGES_SHARE, BentHull, Say
+from reconstruct.hull.bent_hull import JUDGES_BLOCK, JUDGES_SEED, JUDGES_SHARE, BentHull, Say
+from reconstruct.hull.follow_normals import follow_normals, normals_bias
+from reconstruct.hull.normal_integration import integrate_normals
+from reconstruct.hull.shadow_hull import GroundMaps, carved
 from reconstruct.initialization.height_field import HeightConfig, beside_nothing, fit_heights
 from reconstruct.initialization.height_grid import base_of, height_grid
 from reconstruct.initialization.height_view import height_view
 from reconstruct.initialization.light_contradictions import contradictions
-from reconstruct.initialization.normal_integration import follow_normals, integrate_normals, normals_bias
 from reconstruct.initialization.shading_start import heights_from_shading
-from reconstruct.initialization.shadow_hull import GroundMaps, carved
 from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out, without
 from reconstruct.labels.labels import Labels, not_isolated
 from reconstruct.labels.multiple_lights import is_shared

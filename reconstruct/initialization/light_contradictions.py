@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import map_coordinates
 
-from reconstruct.initialization.shadow_hull import GroundMaps, hull_maps
+from reconstruct.hull.shadow_hull import GroundMaps, hull_maps
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.uneven_ground import near_ground
 from reconstruct.scene import Scene

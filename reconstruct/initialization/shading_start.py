@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from reconstruct.hull.normal_integration import MOST_PIXELS, integrate_normals
 from reconstruct.initialization.height_field import HeightField, beside_nothing
 from reconstruct.initialization.height_view import HeightView
-from reconstruct.initialization.normal_integration import MOST_PIXELS, integrate_normals
 from reconstruct.labels.highlights import material_without_ground, matt_photos
 from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.scene import Scene, ground_points, reduced

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 
 from calibration.side_photos.min_cut import cheapest_region, parts_of
 from capture.errors import ReconstructionError
-from reconstruct.initialization.shadow_hull import HEIGHTS, box_over
+from reconstruct.hull.shadow_hull import HEIGHTS, box_over
 from reconstruct.initialization.vote_grid import ShadowPictures, VoteGrid, box_around, shadow_pictures
 from reconstruct.scene import Scene, reduced
 

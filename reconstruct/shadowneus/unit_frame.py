@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from calibration.pose import Pose
-from reconstruct.initialization.shadow_hull import shadow_hull
+from reconstruct.hull.shadow_hull import shadow_hull
 from reconstruct.labels.labels import Labels
 from reconstruct.scene import Scene, lights_in_frame
 from reconstruct.sdf.grid import SdfGrid

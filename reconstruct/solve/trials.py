@@ -13,10 +13,10 @@ import torch
 from capture.errors import ReconstructionError
 from reconstruct.config import FitConfig, Level
 from reconstruct.fields import Verdict
+from reconstruct.hull.shadow_hull import shadow_hull
 from reconstruct.initialization.height_field import HeightConfig, fit_heights
 from reconstruct.initialization.height_grid import height_grid
 from reconstruct.initialization.height_view import HeightView, height_view
-from reconstruct.initialization.shadow_hull import shadow_hull
 from reconstruct.labels.held_out import HeldOut, HeldOuts, draw_blocks, hold_out, without
 from reconstruct.labels.labels import not_isolated
 from reconstruct.labels.observer import Observer

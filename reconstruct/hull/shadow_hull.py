@@ -12,7 +12,7 @@ from calibration.ground.shadow_reach import shadow_reach
 from calibration.outlines.outline_maps import signed_distance
 from calibration.side_view import SideView
 from capture.errors import ReconstructionError
-from reconstruct.initialization.hull_parts import (
+from reconstruct.hull.hull_parts import (
     SURE,
     before_object,
     pixel_rays,

@@ -4,21 +4,13 @@ A ray constrains one point of the surface, and its effect spreads by a few voxel
 therefore stays the dome of the shadow hull, though every normal on it is known. Its depth is the normals' integral.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import cg, spsolve
-from torch import Tensor
-
-from reconstruct.labels.labels import Labels
-from reconstruct.scene import Scene, ground_points
-from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import find_surface
 
 ROUNDS = 6  # of reweighting
 BREAK = 2.0  # pixels between the tangent planes of neighbours that are on different surfaces, before and after
@@ -26,6 +18,7 @@ GUESSED = 2 * BREAK  # pixels of empty space before a depth that is a guess: its
 GUESSED_WIDTHS = (np.inf, 30.0, 9.0)  # of BREAK, for pairs with such a depth, in rounds before the others
 TOUCHING = 10.0  # times heavier when in front of a bound, where nothing can be, than behind it
 OUTSIDE = 1000.0  # of the usual tie, in front of a hull that shadows carved; and where the surface touches that hull
+LIKELY, THERE = 0.5, 0.3  # belief in matter from which the surface is held to it, per squared pixel
 LIKE_HULL = 0.9  # cosine between the normals of hull and shading above which the surface may touch the hull
 WRONG_BOUNDS = 0.05  # share of a hull's pixels that are behind the truth: edges, and beside thin matter that was lost
 HELD_FROM, HELD_ROUNDS = 32.0, 8  # pixels below which an error counts squared, at first; halved in each round, to 1
@@ -36,86 +29,7 @@ OUTLINE, OUTLINE_REACH = 2, 10.0  # pixels about an outline, where shadow edges 
 MOST_PIXELS = 20_000  # solved for at once; more are skipped evenly: only long distances matter here
 DIRECT_PIXELS = 2 * MOST_PIXELS  # factorised in half a second
 CG_STEPS, CG_RESIDUAL = 150, 1e-9  # a wave of a hundred pixels settles in as many steps
-FEWEST_PIXELS = 9
 DUST = 1e-6  # of a tie, or nothing would hold what no other pixel does
-BIAS = np.radians(1.5)  # of normals: common error of a whole side by highlights and interreflection
-LIT_BIAS = np.radians(4.0)  # the same of normals that are read from which lights reach a pixel
-SEEN = 0.3  # of the pixels about a node's must show the object for it to move
-ABOUT = 4.0  # voxels before and behind the surface in which nodes move
-MOST_OF_DEPTH = 0.8  # of the matter along a ray may be taken from its front
-
-Integrate = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # as integrate_normals
-
-
-def follow_normals(
-    grid: SdfGrid,
-    scene: Scene,
-    points: Float[Tensor, "height width 3"],
-    own: Float[Tensor, "height width 3"],
-    labels: Labels,
-    integrate: Integrate,
-    bias: float = BIAS,
-) -> SdfGrid:
-    """Move the grid's visible side to the integral of the labels' normals.
-
-    Args:
-        points: world, where each pixel's ray meets the grid's surface or the ground.
-        own: world, the surface's normals there; 0 on the ground.
-        integrate: what is known of the surface so far: `integrate_normals`, or that it is a shadow hull, which the
-            object is never in front of.
-        bias: rad, of the labels' normals: their integral does not move what it explains.
-
-    Returns:
-        The grid. Where it was moved, only its sign is right: it is no longer a distance.
-    """
-    some = some_pixels(scene, points, own, labels)
-    if some is None:
-        return grid
-    before, rays, seen = some.before, some.rays, np.isfinite(some.before)
-    given = (rays, before, some.own, some.normals, some.trust)
-    after = integrate(*given)
-    after = before + _beyond_bias(after - before, before, rays, bias)
-    part = (slice(None, None, some.step), slice(None, None, some.step))
-    shown = torch.from_numpy(seen)
-    to_ground = (ground_points(scene) - points).norm(dim=-1)[part][shown]
-    matter = _matter_behind(grid, points[part][shown], scene.directions[part][shown], to_ground)
-    after[seen] = np.minimum(after[seen], before[seen] + MOST_OF_DEPTH * matter)
-    return _with_front(grid, scene, before, after, some.step)
-
-
-def normals_bias(scene: Scene) -> float:
-    """Return the common error of a side's normals, rad: from shading, or from which lights reach a pixel."""
-    return BIAS if scene.rgb is not None else LIT_BIAS
-
-
-@dataclass(frozen=True)
-class SomePixels:
-    """Every step-th pixel along each axis of a picture, and what is known there."""
-
-    step: int
-    rays: Float[np.ndarray, "height width 3"]  # unit, world
-    before: Float[np.ndarray, "height width"]  # world length of the ray to the surface so far; nan beside the object
-    own: Float[np.ndarray, "height width 3"]  # world, that surface's normals
-    normals: Float[np.ndarray, "height width 3"]  # world, of shading
-    trust: Float[np.ndarray, "height width"]  # in them, 0 to 1
-
-
-def some_pixels(
-    scene: Scene, points: Float[Tensor, "height width 3"], own: Float[Tensor, "height width 3"], labels: Labels
-) -> SomePixels | None:
-    """Return as many evenly spaced pixels as are integrated at once; None without an object or normals of shading."""
-    on_object = (labels.mask > 0.5) & (own != 0).any(-1)
-    step = 1 + int((float(on_object.sum()) / MOST_PIXELS) ** 0.5)
-    part = (slice(None, None, step), slice(None, None, step))
-    seen = on_object[part].numpy()
-    if seen.sum() < FEWEST_PIXELS or not labels.normal_confidence.any():
-        return None
-    t = (points - scene.eye).norm(dim=-1)[part].numpy().astype(np.float64)
-    read = (labels.normals, labels.normal_confidence)
-    normals, trust = (image[part].numpy().astype(np.float64) for image in read)
-    return SomePixels(
-        step, scene.directions[part].numpy(), np.where(seen, t, np.nan), own[part].numpy(), normals, trust
-    )
 
 
 def integrate_normals(
@@ -165,6 +79,8 @@ def integrate_within(
     own: Float[np.ndarray, "height width 3"],
     normals: Float[np.ndarray, "height width 3"],
     trust: Float[np.ndarray, "height width"],
+    behind: Float[np.ndarray, "height width"] | None = None,
+    matter: Float[np.ndarray, "height width"] | None = None,
 ) -> Float[np.ndarray, "height width"]:
     """Solve for ray lengths t, so that the surface t * ray has the given normals and lies in a shadow hull.
 
@@ -176,18 +92,32 @@ def integrate_within(
     Args:
         hull: t of the hull; nan where there is none.
         own: its normals, which are used where the given ones are not trusted.
+        behind: t that was solved for before.
+        matter: belief that the hull's matter in front of that is there, see `matter_of_hull`. Where it is likely, the
+            hull is the surface; pairs begin with the breaks between it and `behind`.
     """
     where = np.isfinite(hull)
-    t0 = t = hull[where]
+    t0 = hull[where]
     chords = _chords(rays, hull, own, normals, trust)
-    cosine = (own * normals).sum(-1)[where]
-    touching = trust[where] * np.clip((cosine - LIKE_HULL) / (1 - LIKE_HULL), DUST, 1)
+    touching = np.maximum(likeness(own, normals, trust)[where], DUST)
     tie = OUTSIDE * _tie(where, 0)[where] / chords.size**2
-    for wider in (*GUESSED_WIDTHS, *(1.0 for _ in range(ROUNDS))):
+    held = np.zeros(len(t0), bool) if matter is None else matter[where] > LIKELY
+    t = t0 if behind is None else np.where(held | np.isnan(behind[where]), t0, behind[where])
+    for wider in (*(GUESSED_WIDTHS if behind is None else ()), *(1.0 for _ in range(ROUNDS))):
         width = wider * BREAK
         hold = tie * np.where(t < t0, 1, touching * _geman_mcclure((t - t0) / (width * chords.size)) + DUST)
+        hold = np.where(held, THERE / chords.size**2, hold)
         t = _reweighted(chords.slope, np.zeros_like(chords.apart), chords.weight, width, hold, t0, t)
     return _spread(t, where)
+
+
+def likeness(
+    own: Float[np.ndarray, "height width 3"],
+    normals: Float[np.ndarray, "height width 3"],
+    trust: Float[np.ndarray, "height width"],
+) -> Float[np.ndarray, "height width"]:
+    """Return how surely a hull has the normals of shading, 0 to 1: two surfaces that touch have one normal there."""
+    return trust * np.clip(((own * normals).sum(-1) - LIKE_HULL) / (1 - LIKE_HULL), 0, 1)
 
 
 def integrate_behind(
@@ -308,19 +238,6 @@ def _solved(
     )[0]
 
 
-def _beyond_bias(
-    move: Float[np.ndarray, "height width"],
-    before: Float[np.ndarray, "height width"],
-    rays: Float[np.ndarray, "height width 3"],
-    bias: float,
-) -> Float[np.ndarray, "height width"]:
-    """Subtract from a move the part that a common error bias of all normals makes between the outline and a pixel."""
-    pixel = np.linalg.norm(np.diff(rays, axis=1), axis=-1)
-    within = cv2.distanceTransform(np.isfinite(before).astype(np.uint8), cv2.DIST_L2, 5)
-    doubt = np.tan(bias) * within * float(np.median(pixel)) * before
-    return np.sign(move) * np.maximum(np.abs(move) - doubt, 0)
-
-
 def _tie(where: Bool[np.ndarray, "height width"], outline: int) -> Float[np.ndarray, "height width"]:
     """Return the weight of a pixel's tie to its old depth, per squared pixel."""
     inner = cv2.erode(where.astype(np.uint8), np.ones((2 * outline + 1, 2 * outline + 1)), borderValue=0)
@@ -342,45 +259,3 @@ def _neighbours(where: Bool[np.ndarray, "height width"]) -> tuple[Int[np.ndarray
         first.append(a[both])
         second.append(b[both])
     return np.concatenate(first), np.concatenate(second)
-
-
-def _matter_behind(
-    grid: SdfGrid, points: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"], to_ground: Float[Tensor, " n"]
-) -> Float[np.ndarray, " n"]:
-    """Return the world length of matter along rays behind points on the surface: to its end, or to the ground."""
-    hollow = SdfGrid(-grid.values, grid.origin, grid.spacing)
-    inside = points + 0.5 * grid.spacing * rays
-    ends = find_surface(hollow, inside.contiguous(), rays.contiguous())
-    return torch.where(ends.isfinite(), ends, to_ground).nan_to_num(nan=0.0).double().numpy()
-
-
-def _with_front(
-    grid: SdfGrid,
-    scene: Scene,
-    before: Float[np.ndarray, "height width"],
-    after: Float[np.ndarray, "height width"],
-    step: int,
-) -> SdfGrid:
-    """Move the visible side along the camera's rays: a node takes the value at the surface's old position.
-
-    The far side does not move: where the front moves back, only inside nodes change, and where it comes forward, only
-    outside nodes.
-    """
-    there = np.isfinite(before)
-    share = cv2.blur(there.astype(np.float32), (3, 3))
-    maps = [np.where(there, m, 0).astype(np.float32) for m in (before, after - before)]
-    old, shift = (np.where(there, m, cv2.blur(m, (3, 3)) / share.clip(1e-6)) for m in maps)
-    eye = scene.eye.numpy().astype(np.float64)
-    values = grid.values.numpy().copy()
-    across = np.indices(values.shape[1:])
-    for i, slab in enumerate(values):
-        nodes = grid.origin.numpy() + grid.spacing * np.stack([np.full(slab.shape, i), *across], -1)
-        uv = (scene.posed_camera.project(nodes) / step).astype(np.float32)
-        front, by, seen = (cv2.remap(m, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR) for m in (old, shift, share))
-        t = np.linalg.norm(nodes - eye, axis=-1)
-        change = (seen > SEEN) & (np.abs(t - front - by / 2) < np.abs(by) / 2 + ABOUT * grid.spacing)
-        if change.any():
-            back = nodes[change] - (by[change] / t[change])[:, None] * (nodes[change] - eye)
-            moved = grid.sdf(torch.from_numpy(back).float()).numpy()
-            slab[change] = np.where(by[change] > 0, np.maximum(slab[change], moved), np.minimum(slab[change], moved))
-    return SdfGrid(torch.from_numpy(values), grid.origin, grid.spacing)

@@ -12,8 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reconstruct.initialization.hull_parts import without_specks
-from reconstruct.initialization.normal_integration import SomePixels, integrate_normals, some_pixels
+from reconstruct.hull.follow_normals import SomePixels, some_pixels
+from reconstruct.hull.hull_parts import without_specks
+from reconstruct.hull.normal_integration import integrate_normals
 from reconstruct.labels.labels import Labels
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
