@@ -7,6 +7,7 @@ from board_photos import board_photo, corners_of, look_at, slanted
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from calibration.board import recognise
 from calibration.board.board import Board, opencv_dictionary, parse_board
 from calibration.board.board_pose import board_views, fit_ground, locate_ground
 from calibration.board.corners import Corners, find_board
@@ -178,6 +179,14 @@ def test_no_board_is_found_in_noise(board):
 def test_a_board_too_small_in_its_photo_is_not_found(size):
     camera = CAMERA.resized(*size)  # no two corners lie so far apart that an edge between them may be bent
     assert find_board(board_photo(CHARUCO, camera, POSE), CHARUCO) is None
+
+
+def test_a_board_of_many_markers_ends_the_search_for_dictionaries(monkeypatch):
+    asked = []
+    read = recognise._markers
+    monkeypatch.setattr(recognise, "_markers", lambda photo, name: (asked.append(name), read(photo, name))[1])
+    assert guess_board([board_photo(CHARUCO, CAMERA, POSE)])
+    assert set(asked) == {"DICT_4X4_50", "DICT_4X4_1000"}
 
 
 def test_an_unnamed_board_is_recognised_and_its_millimetres_called_assumed():

@@ -29,6 +29,7 @@ MOST_HIDDEN_ROWS = 2  # after the last marker that was read; their corners show 
 ROW_SEEN = 0.5  # of a row's corners make a row
 ON_GRID = 0.15  # squares: how far lens distortion moves a marker from the flat grid
 AGREEING = 0.7  # of the markers; the rest may be false detections
+SURE_MARKERS = 10  # that lie on one board: no other dictionary reads so many by chance, so none is asked
 FEWEST_CORNERS = 20  # inner corners, as of 5 x 4: smaller grids are found in tablecloths
 MANY_CORNERS = 200  # ends the search: more than most prints have
 ENOUGH_PHOTOS = 5  # looked at per question
@@ -79,6 +80,8 @@ def _guess_charuco(photos: Sequence[Grey]) -> Board | None:
             board, n_corners = _with_hidden_rows(_charuco(columns, top, ratio, family), small)
             if n_corners and (best is None or n_corners > best[0]):
                 best = n_corners, board
+        if best and max((one.n_markers for one in layouts), default=0) >= SURE_MARKERS:
+            break
     return best[1] if best else None
 
 

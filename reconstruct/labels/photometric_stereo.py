@@ -49,6 +49,7 @@ class ObjectLabels:
     albedo: Float[Tensor, "height width 3"]  # relative to Scene.power
     visibility: Float[Tensor, "photos height width"]
     confidence: Float[Tensor, "photos height width"]
+    is_alone: bool = False  # each pixel by itself, though so few photos light them that neighbours should help out
 
 
 def label_object(
@@ -58,6 +59,7 @@ def label_object(
     mask: Float[Tensor, "height width"],
     ground: GroundTest | None = None,
     indirect: Indirect | None = None,
+    first_look: bool = False,
 ) -> ObjectLabels:
     """Estimate normals, albedo and shadow labels of the pixels with mask > 0.5, given approximate surface points.
 
@@ -73,6 +75,7 @@ def label_object(
             decides where the photos are too few.
         ground: gives the noise and the light reflected by the ground; without it neither is known.
         indirect: irradiance of surface points by all that object and ground reflect; None: by an endless ground alone.
+        first_look: for the albedo: no pixels are fitted together, which takes ten times as long.
 
     Raises:
         ValueError: the scene has shadow pictures only.
@@ -98,19 +101,14 @@ def label_object(
         inliers[own], errors[own] = weight.sum(1), misfit(pixels, solved[own])
         trust = _normal_trust(pixels, solved[own], weight, usual[row, column])
         _write(labels, scene, part, pixels, solved[own], weight, trust)
-    few = (inliers < FEWEST_INLIERS).float().mean() > OFTEN_FEW and len(places) * len(scene.lights) < MOST_SAMPLES
-    if few:
+    few = bool((inliers < FEWEST_INLIERS).float().mean() > OFTEN_FEW) and len(places) * len(scene.lights) < MOST_SAMPLES
+    if few and not first_look:
         _write_together(labels, scene, places, gather(places), normals, solved, inliers)
     share = torch.where(dilated(~where, 3), EDGE_SHARE, 1.0)
     if not few:
         share[tuple(places.T)] *= _explained(errors)
-    return ObjectLabels(
-        labels.normals,
-        labels.normal_confidence * share,
-        labels.albedo,
-        labels.visibility,
-        labels.confidence * share,
-    )
+    trusted = replace(labels, normal_confidence=labels.normal_confidence * share, confidence=labels.confidence * share)
+    return replace(trusted, is_alone=few and first_look)
 
 
 def _explained(errors: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
