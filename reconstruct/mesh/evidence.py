@@ -20,6 +20,7 @@ PIXELS_BESIDE = 0.3  # the same beside an unconstrained part, where less of the 
 PIXELS_AT_GROUND = 1.3  # the same at the ground, where shadows begin and all light is grazing
 REACH = 0.1  # of the object's diagonal: how far from there these two fade by e
 DRIFT = 0.25  # growth of sigma per distance from constrained surface, beyond which it is extrapolated as a plate
+CELL = 0.05  # of that reach: side of the cells that a distance is told of as a whole where it need not be exact
 NO_LONGER = 7.0  # times that reach: what is left of either is below a thousandth
 GUESS_COHERENCE = 0.4  # of what guessed parts add to the volume if all were off to one side
 SHEARED = 0.8  # of the lights' uncertainty as a share of their distance: growth with height of a shear along the sight
@@ -109,7 +110,7 @@ def _sigma(
     is_held = kind != UNCONSTRAINED
     reach = max(REACH * float(np.linalg.norm(np.ptp(vertices, axis=0))), float(footprint.min()))
     at_ground = PIXELS_AT_GROUND * np.exp(-height / reach)
-    beside = PIXELS_BESIDE * np.exp(-_distance_to(~is_held, vertices, NO_LONGER * reach) / reach)
+    beside = PIXELS_BESIDE * np.exp(-_distance_by_cells(~is_held, vertices, CELL * reach, NO_LONGER * reach) / reach)
     held = footprint * np.sqrt(PIXELS_INSIDE**2 + beside**2 + at_ground**2)
     return np.hypot(held, DRIFT * _distance_to(is_held, vertices))
 
@@ -124,6 +125,21 @@ def _distance_to(
         tree = KDTree(vertices[chosen], balanced_tree=False, compact_nodes=False)
         distance[~chosen] = tree.query(vertices[~chosen], distance_upper_bound=farthest, workers=-1)[0]
     return distance
+
+
+def _distance_by_cells(
+    chosen: Bool[np.ndarray, " n"], vertices: Float[np.ndarray, "n 3"], side: float, farthest: float
+) -> Float[np.ndarray, " n"]:
+    """Return the same, between the means of the vertices in cells of this side; 0 in cells of chosen ones.
+
+    Of a relief's front before its flat back, all about as far away, each vertex by itself took 25 times as long.
+    """
+    cells, own = np.unique(np.floor((vertices - vertices.min(0)) / side).astype(np.int64), axis=0, return_inverse=True)
+    own = own.ravel()
+    count, is_chosen = np.bincount(own), np.zeros(len(cells), bool)
+    is_chosen[own[chosen]] = True
+    means = np.stack([np.bincount(own, along) / count for along in vertices.T], 1)
+    return _distance_to(is_chosen, means, farthest)[own]
 
 
 def _in_picture(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
