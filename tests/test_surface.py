@@ -1,6 +1,7 @@
 """The level set stays a distance function, moves no further than it may, and bends no more than it must."""
 
 import numpy as np
+import pytest
 import torch
 
 from reconstruct.sdf.blocks import pack
@@ -103,9 +104,10 @@ def test_the_box_never_shrinks_however_often_its_grid_is_resampled():
     assert (grid.upper() < first.upper() + spacing).all()
 
 
-def test_the_gradient_by_the_kernel_is_that_of_the_differentiable_sdf_inside_and_beside_the_box():
+@pytest.mark.parametrize("step", [0.5, 1.0])
+def test_the_gradient_by_the_kernel_is_that_of_the_differentiable_sdf_inside_and_beside_the_box(step):
     grid = SdfGrid(torch.from_numpy(ball(15)) * 2, torch.tensor([-30.0, 5.0, 0.0]), 2.0)
     points = torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) * 140 - torch.tensor([60.0, 25.0, 30.0])
-    expected = grid.gradient(points.clone().requires_grad_()).detach()
+    expected = grid.gradient(points.clone().requires_grad_(), step).detach()
     # For the kernel the box ends a thousandth of a voxel before its last node.
-    torch.testing.assert_close(grid.gradient(points), expected, atol=2e-3, rtol=0)
+    torch.testing.assert_close(grid.gradient(points, step), expected, atol=2e-3, rtol=0)

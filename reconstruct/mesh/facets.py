@@ -110,8 +110,6 @@ def facing(
 
     At an edge the differences of a distance function are too short.
     """
-    centres = torch.from_numpy(triangles.mean(1)).float()
-    ways = APART * grid.spacing * torch.eye(3)
-    slopes = torch.stack([grid.sdf(centres + way) - grid.sdf(centres - way) for way in ways], -1).double().numpy()
+    slopes = grid.gradient(torch.from_numpy(triangles.mean(1)).float(), APART).double().numpy()
     length = np.linalg.norm(slopes, axis=1)
-    return slopes / np.maximum(length, 1e-12)[:, None], length > SMOOTH * 2 * APART * grid.spacing
+    return slopes / np.maximum(length, 1e-12)[:, None], length > SMOOTH

@@ -88,16 +88,16 @@ class SdfGrid:
         ).reshape(-1)
         return sampled + self.spacing * torch.linalg.vector_norm(x - inside, dim=-1)
 
-    def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Return the gradient at world points: central differences over half a spacing each way; not normalised."""
+    def gradient(self, points: Float[Tensor, "n 3"], step: float = 0.5) -> Float[Tensor, "n 3"]:
+        """Return the gradient at world points: central differences over step spacings each way; not normalised."""
         tensors = (points, self.values)
         if all(x.device.type == "cpu" and x.dtype == torch.float32 and not x.requires_grad for x in tensors):
             places, out = (points.double() - self.origin.double()) / self.spacing, torch.empty_like(points)
-            gradients(self.blocks, np.ascontiguousarray(places.numpy()), out.numpy())
+            gradients(self.blocks, np.ascontiguousarray(places.numpy()), step, out.numpy())
             return out
-        step = 0.5 * self.spacing
-        offsets = step * torch.eye(3, dtype=points.dtype, device=points.device)
-        return torch.stack([(self.sdf(points + o) - self.sdf(points - o)) / (2 * step) for o in offsets], -1)
+        offsets = step * self.spacing * torch.eye(3, dtype=points.dtype, device=points.device)
+        differences = [self.sdf(points + offset) - self.sdf(points - offset) for offset in offsets]
+        return torch.stack(differences, -1) / (2 * step * self.spacing)
 
     def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
         """Return no features, see reconstruct.shadowneus.field.SdfField."""

@@ -106,14 +106,13 @@ def _extended(phi, x, y, z):
 
 
 @njit(**UNCOUNTED)
-def gradients(phi, points, out):
-    """Write the SDF's gradient at points to out, float32: central differences over half a voxel each way."""
-    h = 0.5
+def gradients(phi, points, h, out):
+    """Write the SDF's gradient at points to out, float32: central differences over h voxels each way."""
     for r in range(len(points)):
         x, y, z = points[r, 0], points[r, 1], points[r, 2]
-        out[r, 0] = _extended(phi, x + h, y, z) - _extended(phi, x - h, y, z)
-        out[r, 1] = _extended(phi, x, y + h, z) - _extended(phi, x, y - h, z)
-        out[r, 2] = _extended(phi, x, y, z + h) - _extended(phi, x, y, z - h)
+        out[r, 0] = (_extended(phi, x + h, y, z) - _extended(phi, x - h, y, z)) / (2 * h)
+        out[r, 1] = (_extended(phi, x, y + h, z) - _extended(phi, x, y - h, z)) / (2 * h)
+        out[r, 2] = (_extended(phi, x, y, z + h) - _extended(phi, x, y, z - h)) / (2 * h)
 
 
 @njit(**INNER)
