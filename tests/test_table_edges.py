@@ -76,6 +76,15 @@ def test_shadows_stains_and_a_ball_on_a_table_without_end_are_no_edge():
     assert seen_beyond(rgb, everywhere(rgb), points, EYE) is None
 
 
+@pytest.mark.parametrize("count", [5, PHOTOS])
+def test_the_straight_edges_of_a_high_object_are_no_edge_of_the_ground(count):
+    points, rng = table_points(), np.random.default_rng(7)
+    rgb = photos(points, np.isfinite(points[..., 0]), 0.0, rng)[:count]
+    for left in (40, 56):  # the sides of a box, each lit in its own way, over three quarters of the picture
+        rgb[:, 12:84, left : left + 16] = rng.uniform(0.05, 0.5, (count, 1, 1, 1))
+    assert not find_table_edges(rgb, everywhere(rgb), points, EYE)
+
+
 def test_an_exposure_that_changes_from_photo_to_photo_is_no_edge_and_hides_none():
     points, rng = table_points(), np.random.default_rng(3)
     gains = np.exp(rng.normal(0, 0.5, (PHOTOS, 1, 1, 1))).astype(np.float32)

@@ -4,7 +4,8 @@ The light of one lamp on one plane is smooth, but for shadows. Where another sur
 its distance or its slope is another one: along that line the brightness changes by a step, and by another step in each
 photo, since the lamp stands elsewhere. The step of an albedo is the same in all photos, and the edge of a shadow lies
 along a line in few of them. So a line is looked for along which the step of the brightness differs most between the
-photos. What lies beyond is no ground: its light comes to another height.
+photos, up to an end of the line, where an object's own edges do not reach. What lies beyond is no ground: its light
+comes to another height.
 """
 
 from collections.abc import Sequence
@@ -23,10 +24,10 @@ NEARBY = np.radians(np.arange(-4, 5))  # angles that are tried around the one th
 STRIP = 2  # px wide, on each side of a line: the step is the difference of their means
 GAP = 1  # px between them
 AROUND = 12  # px of the finer picture on each side of the line that was found
-# Log units, spread of the steps over photos: eight edges and walls show .19 to .41, other lines at most .02 on open
-# tables and .05 across objects.
+# Log units, spread of the steps over photos: a dozen edges and walls show .16 to .48, other lines at most .03.
 LEAST_STEP = 0.1
 PARTS = 2  # of a line, both of which must show the step: the step's sign may change along it
+ENDS = 8  # parts of a line, of which the first or the last must show it: an object's edge ends before the picture does
 FEWEST_PHOTOS = 4  # and half of all, that show a step
 LEAST_LENGTH = 0.25  # of the picture's width
 MOST_PHOTOS = 24
@@ -157,17 +158,23 @@ def _steps(level: np.ndarray, angle: float, offset: float, reach: int) -> tuple[
     step = strip[:, apart:] - strip[:, :-apart]
     step = step[:, apart:-apart] - (step[:, : -2 * apart] + step[:, 2 * apart :]) / 2
     long_enough = np.isfinite(step).sum(2) > LEAST_LENGTH * width
-    typical = np.stack([_median(step[:, :, part], 2) for part in _parts(np.isfinite(step))])
-    spread = np.nan_to_num(1.4826 * _median(np.abs(typical - _median(typical, 1)[:, None]), 1)).min(0)
+    halves, ends = (_parts(np.isfinite(step), count) for count in (PARTS, ENDS))
+    spread = np.minimum(_spread(step, halves).min(0), _spread(step, [ends[0], ends[-1]]).max(0))
     spread[long_enough.sum(0) < max(FEWEST_PHOTOS, n / 2)] = 0
     best = int(np.argmax(spread))
     return float(spread[best]), offset - reach + best + apart + STRIP + (GAP - 1) / 2
 
 
-def _parts(known: Bool[np.ndarray, "photos rows columns"]) -> list[slice]:
+def _spread(step: np.ndarray, parts: Sequence[slice]) -> Float[np.ndarray, "parts rows"]:
+    """Return the spread over photos of the median step in each part of the lines, one sigma; 0 where none is known."""
+    typical = np.stack([_median(step[:, :, part], 2) for part in parts])
+    return np.nan_to_num(1.4826 * _median(np.abs(typical - _median(typical, 1)[:, None]), 1))
+
+
+def _parts(known: Bool[np.ndarray, "photos rows columns"], count: int) -> list[slice]:
     """Divide the columns from the first known one to the last into parts of one length."""
     ends = np.flatnonzero(np.any(known, axis=(0, 1)))
-    cuts = np.linspace(ends[0], ends[-1] + 1, PARTS + 1).astype(int) if len(ends) else np.zeros(PARTS + 1, int)
+    cuts = np.linspace(ends[0], ends[-1] + 1, count + 1).astype(int) if len(ends) else np.zeros(count + 1, int)
     return [slice(low, max(high, low + 1)) for low, high in pairwise(cuts)]
 
 

@@ -13,6 +13,7 @@ from reconstruct.scene import Scene
 SPECK = 0.01  # of the largest part
 ABOUT = 2.0  # nodes: a pixel whose ray passes this close to a kept node has met it
 MISSED = 0.01  # of a camera's object pixels: as many may lose what they met with a floating part
+MET = 0.5  # of a camera's object pixels: as many meet what enough lights need, or fewer lights are enough
 NEAR = 8.0  # nodes from the kept ones within which a missed pixel is given a node
 RAY_STEP = 0.6  # nodes: no node on a ray is stepped over
 RAYS_AT_ONCE = 2000  # 10 MB of indices
@@ -30,6 +31,8 @@ class PixelRays:
 
     def meet(self, keep: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, " rays"]:
         """Return whether each ray passes near a kept node."""
+        if not keep.any():
+            return np.zeros(len(self.pixels), np.bool_)
         near = np.asarray(distance_transform_edt(~keep), dtype=np.float64) < ABOUT
         return np.any(near.reshape(-1)[self.nodes] & self.valid, axis=0)
 
@@ -131,6 +134,23 @@ def pixel_rays(scene: Scene, labels: Labels, lower: np.ndarray, spacing: float, 
         at = np.clip(at, 0, last)
         nodes[:, part] = np.ravel_multi_index((at[..., 0], at[..., 1], at[..., 2]), shape)
     return PixelRays(nodes, valid, t, np.flatnonzero(shown.numpy()))
+
+
+def most_needed(
+    inside: Bool[np.ndarray, "x y z"], needed: UInt8[np.ndarray, "x y z"], needs: int, rays: Sequence[PixelRays]
+) -> tuple[int, Bool[np.ndarray, "x y z"]]:
+    """Return how many lights need each kept node, and these nodes; fewer where object pixels would meet hardly any.
+
+    Of thin rods under ten lights, no node of a coarse grid was needed by two of them, and nothing was left.
+
+    Args:
+        needs: lights, at most.
+    """
+    while True:
+        keep = inside & (needed >= needs)
+        if needs == 1 or all(own.meet(keep).sum() >= MET * len(own.pixels) for own in rays):
+            return needs, keep
+        needs -= 1
 
 
 def with_seen_pixels(keep: np.ndarray, inside: np.ndarray, needed: np.ndarray, rays: PixelRays) -> np.ndarray:

@@ -15,6 +15,7 @@ from capture.errors import ReconstructionError
 from reconstruct.hull.hull_parts import (
     SURE,
     before_object,
+    most_needed,
     pixel_rays,
     with_seen_pixels,
     with_support,
@@ -143,10 +144,9 @@ def carve_grid(
         _carve_beside_picture(values, scene, labels, lower, spacing)
     inside, space = values < 0, values.copy()
     of_a_view = (len(maps.lights) - len(views)) // len(views)  # one view sees ground in a node's shadow, at least
-    needs = 1 + of_a_view // LIGHTS_PER_NEED
-    keep = inside & (needed >= needs)
     above = lower[2] + spacing * np.arange(shape[2]) - views[0][0].ground_height
-    rays = [pixel_rays(scene, labels, lower, spacing, keep.shape) for scene, labels in views]
+    rays = [pixel_rays(scene, labels, lower, spacing, inside.shape) for scene, labels in views]
+    needs, keep = most_needed(inside, needed, 1 + of_a_view // LIGHTS_PER_NEED, rays)
     for (scene, _), own in zip(views, rays, strict=True) if needs == 1 else ():
         keep &= ~before_object(inside, needed, scene, own, lower, spacing)
     for own in rays:
