@@ -125,9 +125,18 @@ def test_where_object_pixels_meet_hardly_any_node_that_enough_lights_need_fewer_
     needed[:, : 3 * rows : 3] = 2  # a pixel meets these rows and their neighbours
     nodes = np.arange(12**3, dtype=np.int32).reshape(12, 144)  # one ray through each node of the first layer
     rays = PixelRays(nodes, np.ones(nodes.shape, bool), np.arange(12, dtype=np.float32), np.arange(144))
-    enough, keep = most_needed(inside, needed, 2, [rays])
+    enough, keep = most_needed(inside, needed, inside, 2, [rays])
     assert enough == needs and keep.sum() == (needed >= needs).sum()
     assert not rays.meet(np.zeros_like(inside)).any()
+
+
+def test_a_node_that_no_light_denies_needs_two_lights_only():
+    inside, needed = np.ones((2, 2, 4), bool), np.array([1, 2, 2, 3], np.uint8)[None, None].repeat(2, 0).repeat(2, 1)
+    denied = np.zeros(inside.shape, bool)
+    denied[..., 2] = True
+    rays = PixelRays(np.arange(16, dtype=np.int32).reshape(1, 16), np.ones((1, 16), bool), np.zeros(1), np.arange(16))
+    enough, keep = most_needed(inside, needed, denied, 3, [rays])
+    assert enough == 3 and keep[0, 0].tolist() == [False, True, False, True]
 
 
 def test_a_hanging_object_that_pixels_need_stays():
@@ -144,7 +153,9 @@ def test_nodes_that_the_camera_proves_empty_need_no_light(monkeypatch, votes):
     grid = shadow_hull(scene, labels_of(scene), votes=votes, nodes=32)
     kernel = carve_kernels.carve
     nothing = np.zeros((0, 0, 0), np.float32)
-    monkeypatch.setattr(carve_kernels, "carve", lambda out, needed, known, *rest: kernel(out, needed, nothing, *rest))
+    monkeypatch.setattr(
+        carve_kernels, "carve", lambda out, needed, denied, known, *rest: kernel(out, needed, denied, nothing, *rest)
+    )
     whole = shadow_hull(scene, labels_of(scene), votes=votes, nodes=32)
     np.testing.assert_array_equal(np.sign(grid.values), np.sign(whole.values))
     near = whole.values.abs() < grid.spacing

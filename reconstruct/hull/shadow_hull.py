@@ -117,17 +117,18 @@ def carve_grid(
     spacing = float((upper - lower).max() / (nodes - 1))
     shape = np.maximum(np.ceil((upper - lower) / spacing).astype(int) + 1, 4)
     by_lights, by_camera = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    needed, unused = np.empty(shape, np.uint8), np.empty(shape, np.uint8)
+    needed, denied = np.empty((2, *shape), np.uint8)
     nothing = np.zeros((0, 0, 0), np.float32)
-    for out, count, known, which, k in (
-        (by_camera, unused, nothing, slice(-len(views), None), 1),  # first: it proves most of the box empty
-        (by_lights, needed, by_camera, slice(0, -len(views)), votes),
+    for out, known, which, k in (
+        (by_camera, nothing, slice(-len(views), None), 1),  # first: it proves most of the box empty
+        (by_lights, by_camera, slice(0, -len(views)), votes),
     ):
         run(
             carve.carve,
             int(shape[0]),
             out,
-            count,
+            needed,
+            denied,
             known,
             lower.astype(float),
             spacing,
@@ -146,7 +147,7 @@ def carve_grid(
     of_a_view = (len(maps.lights) - len(views)) // len(views)  # one view sees ground in a node's shadow, at least
     above = lower[2] + spacing * np.arange(shape[2]) - views[0][0].ground_height
     rays = [pixel_rays(scene, labels, lower, spacing, inside.shape) for scene, labels in views]
-    needs, keep = most_needed(inside, needed, 1 + of_a_view // LIGHTS_PER_NEED, rays)
+    needs, keep = most_needed(inside, needed, denied > 0, 1 + of_a_view // LIGHTS_PER_NEED, rays)
     for (scene, _), own in zip(views, rays, strict=True) if needs == 1 else ():
         keep &= ~before_object(inside, needed, scene, own, lower, spacing)
     for own in rays:

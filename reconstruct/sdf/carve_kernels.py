@@ -75,24 +75,25 @@ def above_ground(lit, points, lights, heights, origin, cell, top, skip, start, s
 
 
 @njit(**FAST)
-def carve(out, needed, known, origin, spacing, lights, maps, field_origin, cell, ground, votes, start, stop):
+def carve(out, needed, denied, known, origin, spacing, lights, maps, field_origin, cell, ground, votes, start, stop):
     """Compute each node's votes-th largest distance to the shadow cones of the lights; positive = proven empty.
 
-    Where it is more than SURELY_EMPTY nodes, it is a smaller one that is as sure, and `needed` is not counted.
+    Where it is more than SURELY_EMPTY nodes, it is a smaller one that is as sure, and the count of `needed` ends early.
 
     A node x is projected from light q to the ground; the signed distance there to the edge of the lit ground, scaled
     back to x (r_x / r_ground) and foreshortened (sine of the elevation), is how far x lies outside the shadow cone.
 
     Args:
-        out, needed: (nx, ny, nz) nodes, slabs start .. stop - 1 are filled; needed counts the lights under which the
-            node's shadow would fall on ground that is seen to be dark. origin, spacing: world.
+        out, needed, denied: (nx, ny, nz) nodes, slabs start .. stop - 1 are filled; needed counts the lights under
+            which its shadow would fall on ground that is seen to be dark; denied is 1 if under one it would on lit.
+        origin, spacing: world.
         known: such distances that already prove nodes empty; empty if nothing does.
         maps: fields, (lights, gx, gy) signed distance inside lit ground, world length, at field_origin + cell * (i, j);
             dark, the same of ground seen in shadow; heights, (gx, gy) of uneven ground there, empty for a plane.
         ground: height of the ground plane.
     """
     field = (*maps, field_origin, cell)
-    _carve(out, needed, known, origin, spacing, lights, field, ground, np.empty(votes), start, stop)
+    _carve(out, needed, denied, known, origin, spacing, lights, field, ground, np.empty(votes), start, stop)
 
 
 @njit(forceinline=True, **INNER)
@@ -108,7 +109,7 @@ def _insert(best, value):
 
 
 @njit(**INNER)
-def _carve(out, needed, known, origin, spacing, lights, field, ground, best, start, stop):
+def _carve(out, needed, denied, known, origin, spacing, lights, field, ground, best, start, stop):
     """Do the work of carve; `best` holds the largest distances of a node."""
     fields, dark, heights, field_origin, cell = field
     votes, enough = len(best), SURELY_EMPTY * spacing
@@ -120,7 +121,7 @@ def _carve(out, needed, known, origin, spacing, lights, field, ground, best, sta
             for k in range(nz):
                 z = origin[2] + k * spacing
                 if known.size > 0 and known[i, j, k] > enough:
-                    out[i, j, k], needed[i, j, k] = known[i, j, k], 0
+                    out[i, j, k], needed[i, j, k], denied[i, j, k] = known[i, j, k], 0, 1
                     continue
                 best[:] = NEVER
                 count = 0
@@ -146,4 +147,4 @@ def _carve(out, needed, known, origin, spacing, lights, field, ground, best, sta
                     if best[votes - 1] > enough:
                         break
                 out[i, j, k] = best[votes - 1]
-                needed[i, j, k] = min(count, 255)
+                needed[i, j, k], denied[i, j, k] = min(count, 255), best[0] > 0
