@@ -5,6 +5,8 @@ B-splines. An LED behind a lens has a hot centre and rings, which no low polynom
 these misplace lights by some 7 % and look like a phone that evens out brightness from photo to photo.
 """
 
+from functools import cache
+
 import numpy as np
 from jaxtyping import Float
 
@@ -24,9 +26,16 @@ def log_gain(cosine: Samples, beam: Float[np.ndarray, " terms"]) -> Samples:
     smooth = log_beam_gain(cosine, beam[:SMOOTH_TERMS])
     if len(beam) <= SMOOTH_TERMS:
         return smooth
-    u = np.linspace(0, 1, PROFILE)
-    profile = _splines(u, len(beam) - SMOOTH_TERMS)[0] @ beam[SMOOTH_TERMS:]
-    return smooth + np.interp(1 - cosine, u, profile)
+    profile = _tabulated(len(beam) - SMOOTH_TERMS) @ beam[SMOOTH_TERMS:]
+    place = (1 - cosine) * (PROFILE - 1)  # equally spaced: numpy.interp, which searches, takes five times as long
+    first = np.minimum(place.astype(np.intp), PROFILE - 2)
+    return smooth + profile[first] + (place - first) * np.diff(profile)[first]
+
+
+@cache
+def _tabulated(count: int) -> Float[np.ndarray, "places terms"]:
+    """Return the splines at PROFILE places from u = 0 to 1."""
+    return _splines(np.linspace(0, 1, PROFILE), count)[0]
 
 
 def derivatives(

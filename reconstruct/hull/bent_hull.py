@@ -45,7 +45,7 @@ SETTLED = 0.5  # voxels: a median move too small to recompute the labels
 JUDGES_SEED = 1  # beside the seed, for the rays that judge the two surfaces: others than those that a level holds out
 # Single pixels, px and share of them: judged in blocks, at a lower sharpness, a relief lost a degree.
 JUDGES_BLOCK, JUDGES_SHARE = 1, 0.05
-FEW_LIGHTS = 20  # under which the hull has normals of its own
+FEW_LIGHTS = 20  # up to which the hull has normals of its own
 CLEARLY = 0.85  # of a hull's shadow error: it is taken bent below it; .79 was better
 BENT_CLEARLY = 0.65  # the same for another bend: of better ones it was .57 at most, of worse ones .73
 
