@@ -43,6 +43,16 @@ def test_another_thing_beside_the_object_is_no_plinth():
     assert (found & beside).sum() == 0 and (found ^ FIGURE).sum() < 0.1 * FIGURE.sum()
 
 
+def test_print_larger_than_the_object_is_not_the_object_whose_shadows_fall_beside_it():
+    block = (ROWS > 30) & (ROWS < 100) & (COLUMNS > 8) & (COLUMNS < 48)
+    field = _field(FIGURE | block)
+    for photo in range(PHOTOS):  # to one side or the other
+        shift = 20 if photo % 2 else -18
+        field.residual[photo, (np.abs(COLUMNS - 80 - shift) < 12) & (ROWS > 74) & (ROWS < 94) & ~FIGURE & ~block] = -1.8
+    found = find_shadows(field).object_mask
+    assert block.sum() > FIGURE.sum() and not found[block].any() and found[FIGURE].mean() > 0.95
+
+
 def test_what_lies_beyond_a_walls_foot_is_no_ground():
     """The foot is a line from border to border, with gaps and the object before it."""
     foot = (np.abs(ROWS - 45 - COLUMNS // 20) < 2) & (COLUMNS % 40 > 1)

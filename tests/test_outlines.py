@@ -14,8 +14,9 @@ from calibration.flashlight.fit import FlashlightFit
 from calibration.flashlight.model import Evidence, Flashlights, free_tangent
 from calibration.flashlight.outline_lights import OUTLINES_WRONG
 from calibration.ground.ground_field import GroundField, fit_ground_field
-from calibration.ground.ground_shadows import GroundShadows, find_shadows, without_seams
+from calibration.ground.ground_shadows import GroundShadows, find_shadows
 from calibration.ground.mirror_highlights import MirrorHighlights, find_highlights
+from calibration.ground.seams import without_seams
 from calibration.lights.ground_cells import GroundCells, ground_points
 from calibration.outlines.carried_light import offset_by_outlines
 from calibration.outlines.coherence import PENUMBRA, residuals, softness
