@@ -157,8 +157,9 @@ def _steps(level: np.ndarray, angle: float, offset: float, reach: int) -> tuple[
     apart = STRIP + GAP
     step = strip[:, apart:] - strip[:, :-apart]
     step = step[:, apart:-apart] - (step[:, : -2 * apart] + step[:, 2 * apart :]) / 2
-    long_enough = np.isfinite(step).sum(2) > LEAST_LENGTH * width
-    halves, ends = (_parts(np.isfinite(step), count) for count in (PARTS, ENDS))
+    known = np.isfinite(step)
+    long_enough = known.sum(2) > LEAST_LENGTH * width
+    halves, ends = (_parts(known.any((0, 1)), count) for count in (PARTS, ENDS))
     spread = np.minimum(_spread(step, halves).min(0), _spread(step, [ends[0], ends[-1]]).max(0))
     spread[long_enough.sum(0) < max(FEWEST_PHOTOS, n / 2)] = 0
     best = int(np.argmax(spread))
@@ -171,9 +172,9 @@ def _spread(step: np.ndarray, parts: Sequence[slice]) -> Float[np.ndarray, "part
     return np.nan_to_num(1.4826 * _median(np.abs(typical - _median(typical, 1)[:, None]), 1))
 
 
-def _parts(known: Bool[np.ndarray, "photos rows columns"], count: int) -> list[slice]:
+def _parts(known: Bool[np.ndarray, " columns"], count: int) -> list[slice]:
     """Divide the columns from the first known one to the last into parts of one length."""
-    ends = np.flatnonzero(np.any(known, axis=(0, 1)))
+    ends = np.flatnonzero(known)
     cuts = np.linspace(ends[0], ends[-1] + 1, count + 1).astype(int) if len(ends) else np.zeros(count + 1, int)
     return [slice(low, max(high, low + 1)) for low, high in pairwise(cuts)]
 

@@ -32,10 +32,16 @@ class PixelRays:
 
     def meet(self, keep: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, " rays"]:
         """Return whether each ray passes near a kept node."""
-        if not keep.any():
-            return np.zeros(len(self.pixels), np.bool_)
-        near = np.asarray(distance_transform_edt(~keep), dtype=np.float64) < ABOUT
-        return np.any(near.reshape(-1)[self.nodes] & self.valid, axis=0)
+        return self.pass_within(_away_from(keep))
+
+    def pass_within(self, away: Float[np.ndarray, "x y z"]) -> Bool[np.ndarray, " rays"]:
+        """Return whether each ray passes a node that is so little away, nodes, from kept ones."""
+        return np.any((away < ABOUT).reshape(-1)[self.nodes] & self.valid, axis=0)
+
+
+def _away_from(keep: Bool[np.ndarray, "x y z"]) -> Float[np.ndarray, "x y z"]:
+    """Return each node's distance to the nearest kept one, nodes; inf if none is kept."""
+    return np.asarray(distance_transform_edt(~keep), dtype=np.float64) if keep.any() else np.full(keep.shape, np.inf)
 
 
 def with_support(keep: np.ndarray) -> np.ndarray:
@@ -163,9 +169,9 @@ def most_needed(
 
 def with_seen_pixels(keep: np.ndarray, inside: np.ndarray, needed: np.ndarray, rays: PixelRays) -> np.ndarray:
     """Restore a needed, nearby node for every object pixel whose ray meets no kept node."""
-    away = np.asarray(distance_transform_edt(~keep), dtype=np.float64)
+    away = _away_from(keep)
     worth = np.where(inside & (away < NEAR), needed - away, -np.inf)
-    unmet = ~rays.meet(keep)
+    unmet = ~rays.pass_within(away)
     flat, valid = rays.nodes[:, unmet], rays.valid[:, unmet]
     score = np.where(valid, worth.reshape(-1)[flat], -np.inf)
     best = np.take_along_axis(flat, score.argmax(0)[None], 0)[0]

@@ -127,12 +127,23 @@ class CellMeans:
 def cell_means(points: Float[np.ndarray, "seen 3"]) -> CellMeans:
     """Sort points into cells, CELLS along the longest side of their box."""
     size = float(np.ptp(points, axis=0).max(initial=0.0)) / CELLS if len(points) else 0.0
+    cell, means = in_cells(points, size)
+    return CellMeans(KDTree(means), cell, size)
+
+
+def in_cells(
+    points: Float[np.ndarray, "n 3"], size: float
+) -> tuple[Integer[np.ndarray, " n"], Float[np.ndarray, "cells 3"]]:
+    """Return the number of each point's cell, and the means of the points in each; one cell for all if size is 0.
+
+    Args:
+        size: of a cell, in the points' length unit.
+    """
     place = np.floor((points - points.min(0)) / size).astype(np.int64) if size > 0 else np.zeros((len(points), 3), int)
     # One number for each cell: sorting rows of three would take ten times as long.
     _, cell = np.unique(np.ravel_multi_index(tuple(place.T), place.max(0, initial=0) + 1), return_inverse=True)
     count = np.bincount(cell)
-    means = np.stack([np.bincount(cell, points[:, axis]) / count for axis in range(3)], 1)
-    return CellMeans(KDTree(means), cell, size)
+    return cell, np.stack([np.bincount(cell, points[:, axis]) / count for axis in range(3)], 1)
 
 
 def camera_rays(posed_camera: PosedCamera, rows: slice) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:

@@ -85,7 +85,7 @@ def carve(out, needed, denied, known, origin, spacing, lights, maps, field_origi
 
     Args:
         out, needed, denied: (nx, ny, nz) nodes, slabs start .. stop - 1 are filled; needed counts the lights under
-            which its shadow would fall on ground that is seen to be dark; denied is 1 if under one it would on lit.
+            which a node's shadow would fall on ground that is seen dark; denied is 1 if under one it is seen lit.
         origin, spacing: world.
         known: such distances that already prove nodes empty; empty if nothing does.
         maps: fields, (lights, gx, gy) signed distance inside lit ground, world length, at field_origin + cell * (i, j);
