@@ -1,6 +1,7 @@
 """Photos from the side: read, posed by the board, the object cut out; and the object's height from session.toml."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,11 +12,13 @@ from calibration.board.board import Board
 from calibration.board.corners import Corners
 from calibration.calibration import Calibration, load_calibration, save_calibration
 from calibration.camera import Camera
+from calibration.ground.shadow_reach import most_height
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.side_photos.ground_look import TripodView, stood_there
 from calibration.side_photos.side_pose import side_pose
-from calibration.side_photos.silhouette import find_silhouette, possible_region
+from calibration.side_photos.side_views import TripodObject
+from calibration.side_photos.silhouette import find_silhouette, possible_region, share_shown
 from calibration.side_view import SideView, from_run_lengths, run_lengths
 from capture.errors import CalibrationError, CaptureError
 from capture.session.declared_objects import Height
@@ -23,6 +26,7 @@ from capture.session.session import load_session, load_settings
 
 CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
 BALL, RADIUS = np.array([90.0, 60.0, 40.0]), 40.0
+FOOT = BALL * [1, 1, 0]
 EYE, SIDE = np.array([0.0, -420.0, 330.0]), np.array([460.0, -60.0, 240.0])
 
 
@@ -33,8 +37,11 @@ def look_at(eye, target):
     return Pose(np.stack([right, np.cross(forward, right), forward], 1), eye)
 
 
-def picture(eye, rng, ball=True):
-    """A table of coarse grain, a pale ball and its soft shadow, in room light; and where the ball is."""
+PALE, BLACK = np.array([0.42, 0.40, 0.38]), np.array([0.006, 0.005, 0.006])
+
+
+def picture(eye, rng, ball=True, colour=PALE):
+    """A table of coarse grain, a ball and its soft shadow, in room light; and where the ball is."""
     camera = PosedCamera(CAMERA, look_at(eye, np.array([60.0, 40.0, 20.0])), 0.0)
     rays = camera.rays(CAMERA.pixel_grid())
     table = camera.on_ground(CAMERA.pixel_grid())
@@ -46,7 +53,7 @@ def picture(eye, rng, ball=True):
         near = np.linalg.norm(table[..., :2] - BALL[:2], axis=-1)
         rgb *= (1 - 0.6 * np.exp(-((near / 30) ** 2)))[..., None]
         shade = np.sqrt(np.clip(1 - (miss / RADIUS) ** 2, 0, 1))
-        rgb[miss < RADIUS] = (np.array([0.42, 0.40, 0.38]) * (0.5 + 0.5 * shade)[..., None])[miss < RADIUS]
+        rgb[miss < RADIUS] = (colour * (0.5 + 0.5 * shade)[..., None])[miss < RADIUS]
     noisy = rgb * np.exp(0.02 * rng.standard_normal(rgb.shape))
     return np.clip(noisy, 0, 1).astype(np.float32), camera, miss < RADIUS
 
@@ -92,17 +99,17 @@ def test_the_pose_is_found_although_the_phone_has_refocused():
     assert "blurred" in str(side_pose(blurred, CAMERA, about))
 
 
-@pytest.mark.parametrize("stood", [False, True])
-def test_the_object_is_cut_out_of_grain_and_shadow(stood):
+@pytest.mark.parametrize(("stood", "colour"), [(False, PALE), (True, PALE), (True, BLACK)])
+def test_the_object_is_cut_out_of_grain_and_shadow(stood, colour):
     rng = np.random.default_rng(1)
-    table, tripod, mask = picture(EYE, rng, ball=stood)
-    lit = np.log(picture(EYE, rng)[0].mean(-1))
+    table, tripod, mask = picture(EYE, rng, stood, colour)
+    lit = np.log(picture(EYE, rng, colour=colour)[0].mean(-1))
     assert stood_there(table, lit, mask) == stood
-    photo, camera, truth = picture(SIDE, rng)
+    photo, camera, truth = picture(SIDE, rng, colour=colour)
     behind = tripod.on_ground(CAMERA.pixel_grid()[mask])
     region = possible_region(camera, behind, EYE, 2.5 * RADIUS)
     assert region[truth].mean() > 0.99
-    found = find_silhouette(photo, camera, region, TripodView(tripod, table, mask & stood))
+    found = find_silhouette(photo, camera, region, TripodView(tripod, table, mask & stood), FOOT)
     assert found is not None
     left, top, width, height = found.window
     part = truth[top : top + height, left : left + width].astype(np.uint8)
@@ -110,6 +117,23 @@ def test_the_object_is_cut_out_of_grain_and_shadow(stood):
     assert (found.mask & true).sum() > 0.93 * (found.mask | true).sum()
     assert (found.sure & (found.mask != true)).sum() < 0.05 * true.sum()
     assert found.sure_outline() > 0.25
+    assert share_shown(found, camera, behind, EYE, 2.5 * RADIUS) > 0.95
+    right = np.arange(found.mask.shape[1]) > np.quantile(np.nonzero(found.mask)[1], 0.8)
+    assert share_shown(replace(found, mask=found.mask & right), camera, behind, EYE, 2.5 * RADIUS) < 0.8
+
+
+def test_the_whole_object_is_looked_for_where_the_tripods_silhouette_lacks_its_top():
+    rng = np.random.default_rng(1)
+    table, tripod, mask = picture(EYE, rng, ball=False)
+    _, camera, truth = picture(SIDE, rng)
+    mask &= np.arange(len(mask))[:, None] > np.flatnonzero(mask.any(1)).mean()
+    seen = TripodObject(tripod, Path("IMG_1.jpg"), mask, np.log(table.mean(-1)))
+    outline, reach = seen.outline(), seen.reach()
+    assert np.abs(reach[reach[:, 2] < 0.01, 2]).max() < 1e-6 and reach[:, 2].min() > -1e-6
+    top = most_height(EYE, outline, reach)
+    assert most_height(EYE, outline) < 2 * RADIUS < top
+    assert possible_region(camera, outline, EYE, most_height(EYE, outline))[truth].mean() < 0.9
+    assert possible_region(camera, reach, EYE, top)[truth].all()
 
 
 def test_a_table_without_an_object_has_no_silhouette():
@@ -117,7 +141,7 @@ def test_a_table_without_an_object_has_no_silhouette():
     table, tripod, mask = picture(EYE, rng, ball=False)
     photo, camera, _ = picture(SIDE, rng, ball=False)
     region = possible_region(camera, tripod.on_ground(CAMERA.pixel_grid()[mask]), EYE, 2.5 * RADIUS)
-    assert find_silhouette(photo, camera, region, TripodView(tripod, table, np.zeros_like(mask))) is None
+    assert find_silhouette(photo, camera, region, TripodView(tripod, table, np.zeros_like(mask)), FOOT) is None
 
 
 def test_side_views_are_saved_with_the_calibration(tmp_path):

@@ -23,7 +23,7 @@ GROUND_LIKE = -0.3  # log likelihood ratio below which a pixel is ground
 LIKELY = -0.1  # mean log likelihood ratio of a photo from which a pixel belongs to the object
 FEWEST_PHOTOS = 3
 AROUND = np.ones((9, 9), np.uint8)  # of a part: where its shadow begins
-SHADOWED = 0.03  # of that, in the median photo, is in an object's shadow, at least
+SHADOWED = 0.1  # of the most shadow beside any rival: less beside a part, and it throws none
 RIVAL = 0.2  # of the largest part's size: another that may be the object in its stead
 PLINTH_GAP = 0.02  # of the picture's long side: between a plinth's side and what stands on it
 LEAST_STRIP = 0.3  # of the object's extent: a shorter part is no side of a plinth, and no box on a box
@@ -244,22 +244,21 @@ def _shadowed(
     """Return the number of the largest part that throws shadows, of those not far smaller than the largest.
 
     Black print on the ground may be too dark to be like ground, and larger than a black object beside it. In a typical
-    photo an object has 16 to 24 % of the ground around it in its shadow, such print has .1 %. If no part has shadow
-    beside it, the largest is meant.
+    photo an object has 2 to 24 % of the ground around it in its shadow, as the lights are high or low; such print has
+    .1 % where the object beside it has 16 %. If no part has shadow beside it, the largest is meant.
 
     Args:
         likely: where any part may be.
         sizes: of the parts, px; 0 where one is out of the question.
     """
     dark = field.usable & (field.residual < DARK)
-    for number in np.argsort(-sizes, kind="stable"):
-        if sizes[number] < RIVAL * sizes.max():
-            break
+    rivals = [number for number in np.argsort(-sizes, kind="stable") if sizes[number] >= RIVAL * sizes.max()]
+    shares = []
+    for number in rivals:
         part = parts == number
         around = (cv2.dilate(part.astype(np.uint8), AROUND) > 0) & ~_grown(part) & ~likely
-        if around.any() and np.median(dark[:, around].mean(1)) > SHADOWED:
-            return int(number)
-    return int(sizes.argmax())
+        shares.append(np.median(dark[:, around].mean(1)) if around.any() else 0.0)
+    return int(rivals[int(np.argmax(np.array(shares) >= SHADOWED * max(shares)))])
 
 
 def _with_plinth(

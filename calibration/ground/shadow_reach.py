@@ -9,7 +9,9 @@ SLICES = 12  # of the object by height; neighbours overlap by the margin
 NEAREST = 1.0  # per cent of the outline's points that may be nearer than its foot
 
 
-def most_height(eye: Float[np.ndarray, "3"], outline: Float[np.ndarray, "n 3"]) -> float:
+def most_height(
+    eye: Float[np.ndarray, "3"], outline: Float[np.ndarray, "n 3"], reach: Float[np.ndarray, "rays 3"] | None = None
+) -> float:
     """Return the height above the ground that the object cannot exceed if none of it is nearer than its foot.
 
     A ray that meets the ground at the distance r from the point below the camera is (1 - f / r) of the camera's height
@@ -18,10 +20,18 @@ def most_height(eye: Float[np.ndarray, "3"], outline: Float[np.ndarray, "n 3"]) 
     Args:
         eye: camera centre, world.
         outline: world points where the rays of the object's pixels meet the ground.
+        reach: world points on all rays that may meet the object, if those are more.
     """
-    away = np.linalg.norm(outline[:, :2] - eye[:2], axis=1)
-    share = 1 - np.percentile(away, NEAREST) / away.max() if len(away) else 0.0
-    return float(min(share, HIGHEST) * (eye[2] - outline[:, 2].mean())) if len(away) else 0.0
+    if len(outline) == 0:
+        return 0.0
+    away, height = np.linalg.norm(outline[:, :2] - eye[:2], axis=1), float(eye[2] - outline[:, 2].mean())
+    foot = float(np.percentile(away, NEAREST))
+    if reach is None:
+        share = 1 - foot / float(away.max())
+    else:
+        slope = (reach[:, 2] - eye[2]) / np.linalg.norm(reach[:, :2] - eye[:2], axis=1)
+        share = 1 + foot * float(slope.max()) / height
+    return min(share, HIGHEST) * height
 
 
 def shadow_reach(

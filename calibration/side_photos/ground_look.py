@@ -37,6 +37,7 @@ class GroundLook:
     residual: Float[np.ndarray, "height width 3"]  # log photo minus log table, smooth gain taken off; 0 where unknown
     error: Float[np.ndarray, "height width 3"]  # one sigma of it on bare table
     known: Bool[np.ndarray, "height width"]  # the tripod saw the table here
+    hidden: Bool[np.ndarray, "height width"]  # the object hid the table from the tripod here
 
 
 def stood_there(
@@ -75,10 +76,10 @@ def ground_look(
         log_rgb: of the window, smoothed by SEEN_WIDTH; camera: of the window.
         region: where the object may be.
     """
-    table, known = _table(camera, tripod)
+    table, known, hidden = _table(camera, tripod)
     raw = np.where(known[..., None], log_rgb - table, 0.0).astype(np.float32)
     if (known & ~region).sum() < 100:
-        return GroundLook(raw, np.ones_like(raw), np.zeros_like(known))
+        return GroundLook(raw, np.ones_like(raw), np.zeros_like(known), hidden)
     slope = np.abs(np.gradient(table, axis=0)) + np.abs(np.gradient(table, axis=1))
     outside = known & ~region
     vote, sigma = outside.astype(np.float32), np.full(3, 0.2)
@@ -90,11 +91,11 @@ def ground_look(
         error = np.hypot(sigma, SHIFT * slope)
         size = np.sqrt(((residual / error) ** 2).mean(-1))
         vote = (np.where(region, BELIEVED_INSIDE, 1.0) * known / (1 + (size / 2) ** 2) ** 2).astype(np.float32)
-    return GroundLook(np.where(known[..., None], residual, 0.0), np.hypot(sigma, SHIFT * slope), known)
+    return GroundLook(np.where(known[..., None], residual, 0.0), np.hypot(sigma, SHIFT * slope), known, hidden)
 
 
 def _table(camera: PosedCamera, tripod: TripodView):
-    """Return the log colour of the table at each pixel, and where the tripod saw it."""
+    """Return the log colour of the table at each pixel, where the tripod saw it, and where the object hid it."""
     rays = camera.rays(camera.camera.pixel_grid())
     down = rays[..., 2] < -FLATTEST
     reach = (camera.ground_height - camera.centre[2]) / np.where(down, rays[..., 2], -1.0)
@@ -104,11 +105,11 @@ def _table(camera: PosedCamera, tripod: TripodView):
     known = down & (depth > 0) & inside
     at = np.where(known[..., None], pixels, -10).astype(np.float32)
     hidden = cv2.dilate(tripod.hides.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(np.float32)
-    known &= cv2.remap(hidden, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=1) < 0.01
+    free = cv2.remap(hidden, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=1) < 0.01
     log = np.log(np.maximum(tripod.rgb, DARKEST)).astype(np.float32)
     finer = max(1.0, float(tripod.posed_camera.camera.fx / camera.camera.fx))
     log = cv2.GaussianBlur(log, (0, 0), SEEN_WIDTH * finer)
-    return cv2.remap(log, at[..., 0], at[..., 1], cv2.INTER_LINEAR), known
+    return cv2.remap(log, at[..., 0], at[..., 1], cv2.INTER_LINEAR), known & free, known & ~free
 
 
 def _smooth(values: Float[np.ndarray, "height width 3"], vote: Float[np.ndarray, "height width"]) -> np.ndarray:

@@ -13,13 +13,13 @@ from calibration.board.board_pose import SAME_LENS
 from calibration.board.corners import Corners, find_board, grey_of
 from calibration.ground.ground_field import fit_ground_field
 from calibration.ground.ground_shadows import find_shadows
-from calibration.ground.shadow_reach import most_height
+from calibration.ground.shadow_reach import NEAREST, most_height
 from calibration.lights.ground_cells import beyond_ends, ground_ends, ground_points
 from calibration.outlines.metric_cues import MetricCues
 from calibration.posed_camera import PosedCamera
 from calibration.side_photos.ground_look import TripodView, stood_there
 from calibration.side_photos.side_pose import side_pose
-from calibration.side_photos.silhouette import find_silhouette, possible_region
+from calibration.side_photos.silhouette import find_silhouette, possible_region, share_shown
 from calibration.side_view import SideView
 from capture.photos.photo import Photo, PhotoStack, read_photo
 from capture.session.session import Session
@@ -27,7 +27,9 @@ from capture.session.session import Session
 OnSheet = Callable[[Corners], Corners]
 
 LEAST_SURE = 0.25  # of a silhouette's outline: less fixes nothing
+LEAST_SHOWN = 0.8  # of the tripod's silhouette: up to .13 of it may be shadow; where much is missing, .74 and less
 OUTLINE_POINTS = 2000  # of the tripod's silhouette
+GROWN = 0.4  # of the silhouette's extent: before lights are known, thin and high parts may be missing in it
 LIFTED = 0.15  # of the way to the camera: points amid the object
 
 
@@ -59,6 +61,19 @@ class TripodObject:
         found = points[self.mask & down]
         return found[:: max(1, len(found) // OUTLINE_POINTS)]
 
+    def reach(self) -> Float[np.ndarray, "n 3"]:
+        """Return where rays that may meet the object end: on the ground, or as far away as rays of the mask do."""
+        camera = self.posed_camera.resized(self.mask.shape[1], self.mask.shape[0])
+        rows, columns = np.nonzero(self.mask)
+        size = 2 * round(GROWN * max(np.ptp(rows), np.ptp(columns))) + 1
+        grown = cv2.dilate(self.mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, [size] * 2))
+        rim = np.argwhere(cv2.morphologyEx(grown, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8), borderValue=0) > 0)
+        rays = camera.rays(rim[:, ::-1].astype(float))
+        _, farthest = camera.project_with_depth(self.outline())
+        drop = camera.ground_height - camera.centre[2]
+        depth = drop / np.minimum(rays[:, 2], drop / farthest.max())
+        return camera.centre + depth[:, None] * rays
+
 
 def side_views(paths: Sequence[Path], board: Board, on_sheet: OnSheet, seen: TripodObject) -> list[SideResult]:
     """Return what becomes of each photo; one full photo in memory at a time.
@@ -73,11 +88,11 @@ def side_views(paths: Sequence[Path], board: Board, on_sheet: OnSheet, seen: Tri
     if len(outline) == 0:
         reason = "no object stands out in the tripod's photos, so nothing tells where to look for it"
         return [SideResult(path.name, None, reason) for path in paths]
-    reference = read_photo(seen.board_photo)
+    reference, reach = read_photo(seen.board_photo), seen.reach()
     tripod = _tripod(reference, seen)
     results = []
     for path in paths:
-        found = _side_view(read_photo(path), reference, board, on_sheet, tripod, outline)
+        found = _side_view(read_photo(path), reference, board, on_sheet, tripod, outline, reach)
         view, reason = (None, found) if isinstance(found, str) else (found, "")
         results.append(SideResult(path.name, view, reason))
     return results
@@ -135,6 +150,7 @@ def _side_view(
     on_sheet: OnSheet,
     tripod: TripodView,
     outline: Float[np.ndarray, "n 3"],
+    reach: Float[np.ndarray, "rays 3"],
 ) -> SideView | str:
     camera, eye = tripod.posed_camera.camera, tripod.posed_camera.centre
     height, width = photo.rgb.shape[:2]
@@ -156,13 +172,22 @@ def _side_view(
     if isinstance(pose, str):
         return pose
     view = PosedCamera(pose.camera, pose.world_from_camera, tripod.posed_camera.ground_height)
-    region = possible_region(view, outline, eye, most_height(eye, outline))
-    found = find_silhouette(photo.rgb, view, region, tripod)
+    top = most_height(eye, outline, reach)
+    region = possible_region(view, reach, eye, top)
+    away = np.linalg.norm(outline[:, :2] - eye[:2], axis=1)
+    foot = outline[away <= np.percentile(away, NEAREST)].mean(0)
+    found = find_silhouette(photo.rgb, view, region, tripod, foot)
     if found is None:
         return "the object does not stand out from the table in it. Keep it in view, in even room light"
     if found.sure_outline() < LEAST_SURE:
         return (
             f"only {found.sure_outline():.0%} of the object's outline is sure in it ({LEAST_SURE:.0%} needed): it "
             "looks like what lies behind it. Choose a side with a plainer background, in even room light"
+        )
+    shown = share_shown(found, view, outline, eye, top)
+    if shown < LEAST_SHOWN:
+        return (
+            f"only {shown:.0%} of what the tripod saw of the object is found in it ({LEAST_SHOWN:.0%} needed): the "
+            "rest looks like what lies behind it. Choose a side with a plainer background, in even room light"
         )
     return SideView(photo.path.name, view, found.window, found.mask, found.sure, pose.sigma_px)

@@ -6,6 +6,7 @@ Jolly 2001; Rother, Kolmogorov and Blake 2004, who fit the colours in turn]. Wha
 favoured is sure.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -14,22 +15,28 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_fill_holes, label
 
 from calibration.posed_camera import PosedCamera
-from calibration.side_photos.ground_look import DARKEST, SEEN_WIDTH, GroundLook, TripodView, ground_look
+from calibration.side_photos.ground_look import DARKEST, NARROWEST, SEEN_WIDTH, GroundLook, TripodView, ground_look
 from calibration.side_photos.min_cut import cheapest_region
+from capture.checks.robust import column_spread
 
+BESIDE_FOUND = 0.5  # of what is found in the whole region: more of the object may lie beside it
 WINDOW = 360  # px: longer side of the window that is cut
 AROUND = 0.12  # of the region's size: table beside it that tells noise and colours
-SLICES = 24  # of the space where the object may be
+SLICES = 48  # of the space where the object may be
 LARGEST = 9.0  # nats for one pixel: beyond, something else happened
 SHADED = 1.0  # sigmas: what is darker than that may lie in the soft shadow of room light around the object
+SHADE = 0.4  # nats of darkening for one nat of odds: few shadows of room light are much deeper
 DARKER, BESIDE = 2.5, 3  # sigmas, px: table that is this much darker lies in a shadow, which may go on
 ANYTHING = 3.0  # nats: what an object costs that may have any colour
+UNSEEN = 1.5  # nats: what the tripod's picture does not show is rather more table
 COLOURS = 12  # bins of each colour axis
-COLOUR_SHARE = 1.0  # of the colours' odds where the table is known as well
 LINK = 12.0  # nats: cost of a cut between alike pixels
 ROUNDS = 3
 FAVOUR = 1.5  # nats for one pixel
+RIM = 3  # px to both sides of the outline in which it may lie
+CLEAR = 6.0  # sigmas of the step there: the cut alone puts the outline at 2 to 3, half way up a step of 5
 SMALLEST = 60  # px of the window
+RIVAL = 0.1  # of the largest part's size: another that may be the object in its stead
 
 
 @dataclass(frozen=True)
@@ -45,24 +52,32 @@ class Silhouette:
         rim = self.mask & ~(cv2.erode(self.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
         return float((rim & self.sure).sum()) / max(int(rim.sum()), 1)
 
+    def shows(self, pixels: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
+        """Return whether the object covers pixels of the photo."""
+        height, width = self.mask.shape
+        left, up, *size = self.window
+        at = np.floor((pixels - [left, up] + 0.5) * [width / size[0], height / size[1]]).astype(int)
+        inside = np.asarray(((at >= 0) & (at < [width, height])).all(-1))
+        at = np.where(inside[..., None], at, 0)
+        return inside & self.mask[at[..., 1], at[..., 0]]
+
 
 def possible_region(
     camera: PosedCamera,
-    outline: Float[np.ndarray, "n 3"],
+    reach: Float[np.ndarray, "n 3"],
     eye: Float[np.ndarray, "3"],
     top: float,
 ) -> Bool[np.ndarray, "height width"]:
-    """Return where a photo may show what the tripod saw: the rays of its outline between table and `top`.
+    """Return where a photo may show what the tripod saw: the rays of its pixels from their ends up to `top`.
 
     Args:
         camera: of the side photo.
-        outline: world points where rays of the object's pixels in the tripod's photo meet the table.
+        reach: world points, at or above the table, where the tripod's rays through the object's pixels end.
         eye: the tripod's camera centre; top: world length above the table.
     """
     region = np.zeros((camera.camera.height, camera.camera.width), np.uint8)
     before = None
-    for height in np.linspace(0, top, SLICES):
-        points = outline + (eye - outline) * (height / (eye[2] - camera.ground_height))
+    for points in _levels(camera, reach, eye, top):
         pixels, depth = camera.project_with_depth(points)
         if (depth <= 0).any():
             before = None
@@ -74,18 +89,72 @@ def possible_region(
     return region > 0
 
 
+def share_shown(
+    silhouette: Silhouette,
+    camera: PosedCamera,
+    outline: Float[np.ndarray, "n 3"],
+    eye: Float[np.ndarray, "3"],
+    top: float,
+) -> float:
+    """Return the share of the tripod's rays through the object's pixels that pass behind or before the silhouette.
+
+    Args: as for possible_region, but for `outline`: world points where the rays meet the table.
+    """
+    found = np.zeros(len(outline), bool)
+    for points in _levels(camera, outline, eye, top):
+        pixels, depth = camera.project_with_depth(points)
+        found |= (depth > 0) & silhouette.shows(pixels)
+    return float(found.mean())
+
+
+def _levels(
+    camera: PosedCamera, reach: Float[np.ndarray, "n 3"], eye: Float[np.ndarray, "3"], top: float
+) -> Iterator[Float[np.ndarray, "n 3"]]:
+    """Yield world points on the rays from `reach` to the eye, level by level up to `top` above the table."""
+    for height in np.linspace(0, top, SLICES):
+        share = np.maximum(height - (reach[:, 2] - camera.ground_height), 0) / (eye[2] - reach[:, 2])
+        yield reach + (eye - reach) * share[:, None]
+
+
 def find_silhouette(
     rgb: Float[np.ndarray, "height width 3"],
     camera: PosedCamera,
     region: Bool[np.ndarray, "height width"],
     tripod: TripodView,
+    foot: Float[np.ndarray, "3"],
 ) -> Silhouette | None:
-    """Return the silhouette in a window around the region; None where nothing stands out.
+    """Return the silhouette in a window around the object; None where nothing stands out.
+
+    The object may be small in its region. What is found there is looked at again in a window that it fills.
 
     Args:
         rgb: linear, the whole photo; camera: of this photo.
         region: of possible_region.
+        foot: world point on the table where the object stands: of several things there, that one is meant.
     """
+    found = _in_window(rgb, camera, region, tripod, foot)
+    if found is None:
+        return None
+    left, up, width, height = found.window
+    mask = cv2.resize(found.mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    pad = round(BESIDE_FOUND * max(np.ptp(rows), np.ptp(columns)))
+    near = np.zeros_like(region)
+    box = [
+        slice(max(start + int(at[0]) - pad, 0), start + int(at[-1]) + pad + 1)
+        for start, at in ((up, rows), (left, columns))
+    ]
+    near[*box] = True
+    return _in_window(rgb, camera, region & near, tripod, foot)
+
+
+def _in_window(
+    rgb: Float[np.ndarray, "height width 3"],
+    camera: PosedCamera,
+    region: Bool[np.ndarray, "height width"],
+    tripod: TripodView,
+    foot: Float[np.ndarray, "3"],
+) -> Silhouette | None:
     window = _window(region)
     if window is None:
         return None
@@ -98,20 +167,55 @@ def find_silhouette(
     log = cv2.GaussianBlur(np.log(np.maximum(part, DARKEST)).astype(np.float32), (0, 0), SEEN_WIDTH)
     look = ground_look(log, view, near, tripod)
     odds = _table_odds(look)
-    links = _links(log, look)
-    mask, colours = _cut(odds, links, near, 0.0), np.zeros_like(odds)
+    links, place = _links(log, look), view.project(foot)
+    mask, colours = _nearest(_cut(odds, links, near, 0.0), place), np.zeros_like(odds)
     for _ in range(ROUNDS):
         if mask.sum() < SMALLEST:
             return None
         colours = _colour_odds(log, mask & (odds + colours >= 0), ~mask & (~near | (odds < -1)))
-        mask = _cut(_together(odds, colours, look), links, near, 0.0)
-    both = _together(odds, colours, look)
+        mask = _nearest(_cut(odds + colours, links, near, 0.0), place)
+    both = odds + colours
     more, less = (_cut(both, links, near, favour) for favour in (FAVOUR, -FAVOUR))
-    mask = _largest(mask)
+    mask = _to_half_way(mask, log, look)
     if mask.sum() < SMALLEST:
         return None
-    apart = (_largest(more) & ~mask) | (mask & ~less) | _maybe_shade(mask, look)
+    unseen = near & ~look.known & ~mask  # colours alone speak for the table, and an object has more than one
+    apart = (_nearest(more, place) & ~mask) | (mask & ~less) | _maybe_shade(mask, look) | unseen
     return Silhouette(mask, ~apart, window)
+
+
+def _to_half_way(
+    mask: Bool[np.ndarray, "height width"], log: Float[np.ndarray, "height width 3"], look: GroundLook
+) -> Bool[np.ndarray, "height width"]:
+    """Return the mask with its outline where the photo is half way between the object's colour and the table's.
+
+    A cut calls all that is surely not the bare table object, so that a strong edge lies at the outer end of its blur.
+    """
+    disc = np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)
+    inner, outer = cv2.erode(mask.astype(np.uint8), disc) > 0, cv2.dilate(mask.astype(np.uint8), disc) > 0
+    rim, moved = outer & ~inner, mask.copy()
+    plain = log[~outer]
+    texture = column_spread(plain - np.median(plain, axis=0)) if len(plain) else np.full(3, np.inf)
+    for values, error, seen in ((look.residual, look.error, look.known), (log, texture, np.ones_like(mask))):
+        (thing, has_thing), (table, has_table) = (_mean_near(values, seen & side) for side in (inner, ~outer))
+        step = thing - table
+        share = ((values - table) * step).sum(-1) / np.maximum((step**2).sum(-1), NARROWEST**2)
+        is_clear = (step**2).sum(-1) > ((CLEAR * error) ** 2).sum(-1)
+        decided = rim & seen & has_thing & has_table & is_clear
+        moved = np.where(decided, share > 0.5, moved)
+        rim = rim & ~decided
+    return moved
+
+
+def _mean_near(
+    values: Float[np.ndarray, "height width 3"], region: Bool[np.ndarray, "height width"]
+) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
+    """Return the mean of a region's values near each pixel, and where there are any."""
+    weight = region.astype(np.float32)
+    total, count = (
+        cv2.GaussianBlur(one, (0, 0), RIM) for one in (values.astype(np.float32) * weight[..., None], weight)
+    )
+    return total / np.maximum(count, 1e-6)[..., None], count > 1e-2
 
 
 def _maybe_shade(mask: Bool[np.ndarray, "height width"], look: GroundLook) -> Bool[np.ndarray, "height width"]:
@@ -133,17 +237,19 @@ def _window(region: Bool[np.ndarray, "height width"]) -> tuple[int, int, int, in
 
 
 def _table_odds(look: GroundLook) -> Float[np.ndarray, "height width"]:
-    """Return log odds of object over table from the deviation; 0 where the table is unknown.
+    """Return log odds of object over table from the deviation; 0 where the object hid the table from the tripod.
 
     Around an object its soft shadow and, on varnish, its mirror image darken the table: what is darker than the table
-    may be either, and its colours decide.
+    may be either, and its colours decide, unless it is darker than such shadows are.
     """
     grey = look.residual.mean(-1)
     colour = ((look.residual - grey[..., None]) / look.error) ** 2
     noise = look.error.mean(-1)
     deviation = 0.5 * (colour.sum(-1) + (grey / noise) ** 2)
     odds = np.minimum(deviation, LARGEST) - ANYTHING
-    return np.where(look.known, np.where(grey < -SHADED * noise, np.minimum(odds, 0.0), odds), 0.0)
+    shade = np.maximum(-grey / SHADE - ANYTHING, 0.0)
+    odds = np.where(grey < -SHADED * noise, np.minimum(odds, shade), odds)
+    return np.where(look.known, odds, np.where(look.hidden, 0.0, -UNSEEN))
 
 
 def _links(log: Float[np.ndarray, "height width 3"], look: GroundLook):
@@ -185,10 +291,6 @@ def _blurred(cells: Float[np.ndarray, "a b c"]) -> Float[np.ndarray, "a b c"]:
     return cells
 
 
-def _together(odds: np.ndarray, colours: np.ndarray, look: GroundLook) -> np.ndarray:
-    return np.where(look.known, odds + COLOUR_SHARE * colours, colours)
-
-
 def _cut(odds: np.ndarray, links: list[np.ndarray], region: np.ndarray, favour: float) -> Bool[np.ndarray, "h w"]:
     """Return the cheapest cut; outside the region there is no object."""
     gain = np.where(region, odds + favour * (region & (np.abs(odds) < 20)), -20.0).astype(float)
@@ -196,9 +298,14 @@ def _cut(odds: np.ndarray, links: list[np.ndarray], region: np.ndarray, favour: 
     return cheapest_region(np.maximum(-gain, zero), np.maximum(gain, zero), *(one.astype(float) for one in links))
 
 
-def _largest(mask: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+def _nearest(mask: Bool[np.ndarray, "height width"], place: Float[np.ndarray, "2"]) -> Bool[np.ndarray, "height width"]:
+    """Return the part of the mask, holes filled, that is nearest to a pixel; of those that are not small."""
     parts = np.empty(mask.shape, np.int32)
     label(mask, output=parts)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    return np.asarray(binary_fill_holes(parts == int(sizes.argmax()))) if sizes.any() else np.zeros_like(mask)
+    if not sizes.any():
+        return np.zeros_like(mask)
+    rows, columns = np.nonzero(mask & (sizes[parts] >= RIVAL * sizes.max()))
+    at = int(np.hypot(columns - place[0], rows - place[1]).argmin())
+    return np.asarray(binary_fill_holes(parts == parts[rows[at], columns[at]]))
