@@ -53,6 +53,18 @@ def test_print_larger_than_the_object_is_not_the_object_whose_shadows_fall_besid
     assert block.sum() > FIGURE.sum() and not found[block].any() and found[FIGURE].mean() > 0.95
 
 
+def test_the_larger_part_stays_the_object_where_high_lights_throw_little_shadow_beside_either():
+    block = (ROWS > 50) & (ROWS < 80) & (COLUMNS > 20) & (COLUMNS < 48)
+    field = _field(FIGURE | block)
+    under = (ROWS > 80) & (ROWS < 84)
+    for photo in range(PHOTOS):  # to one side or the other
+        side = 1 if photo % 2 else -1
+        field.residual[photo, under & (np.abs(COLUMNS - 80 - 16 * side) < 2)] = -1.8
+        field.residual[photo, (ROWS > 62) & (ROWS < 80) & (np.abs(COLUMNS - 34 - 16 * side) < 3) & ~block] = -1.8
+    found = find_shadows(field).object_mask
+    assert found[FIGURE].mean() > 0.95 and not found[block].any()
+
+
 def test_what_lies_beyond_a_walls_foot_is_no_ground():
     """The foot is a line from border to border, with gaps and the object before it."""
     foot = (np.abs(ROWS - 45 - COLUMNS // 20) < 2) & (COLUMNS % 40 > 1)
