@@ -74,8 +74,8 @@ export function capture(name, again) {
   }
 
   function counts(row) {
-    const lit = row.photos.filter((photo) => photo.role === "lit").length, board = row.photos.filter((photo) => photo.role === "board").length;
-    const told = [plural(row.photos.length, "photo"), lit && `${lit} under the flashlight`, board && `${board} of the board`];
+    const [lit, board, side] = ["lit", "board", "side"].map((role) => row.photos.filter((photo) => photo.role === role).length);
+    const told = [plural(row.photos.length, "photo"), lit && `${lit} under the flashlight`, board && `${board} of the board`, side && `${side} from the side`];
     return told.filter(Boolean).join(", ");
   }
 
