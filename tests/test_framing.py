@@ -13,7 +13,15 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.reframed import UNPLACED, Doubt, reframed, with_doubt
-from capture.checks.framing import NOT_COMPARED, NOT_SHOWN, REFRAMED, SEEN_FROM, ZOOM_STATED, framing_findings
+from capture.checks.framing import (
+    NOT_COMPARED,
+    NOT_SHOWN,
+    REFRAMED,
+    SEEN_FROM,
+    ZOOM_STATED,
+    _framing,
+    framing_findings,
+)
 from capture.checks.moved_photos import check_and_register
 from capture.photos.photo import PhotoStack
 
@@ -64,6 +72,17 @@ def framed(stack: PhotoStack, board: PhotoStack):
 
 def test_photos_of_the_board_s_view_are_not_spoken_of(stack, board):
     assert framed(stack, board) == []
+
+
+@pytest.mark.parametrize(("resting", "moves"), [(11, False), (7, True)])
+def test_a_motion_that_explains_hardly_more_than_a_picture_that_stands_still_is_chance(resting, moves):
+    rng = np.random.default_rng(4)
+    places = rng.uniform(60, 420, (resting + 14, 2)).astype(np.float32)
+    words = rng.normal(size=(len(places), 128)).astype(np.float32)  # each point is like itself alone
+    there = places.copy()
+    there[resting:] = cv2.transform(places[resting:, None], about_middle(1.1, 8)[:2])[:, 0] + 20
+    found = _framing((places, words), (there, words), 1.0)
+    assert found is not None and (found.motion(640, 480) > 20) == moves
 
 
 @pytest.mark.parametrize(("scale", "degrees"), [(1.1, 0), (1.3, 0), (0.9, 0), (1.0, 180), (1.1, 180)])

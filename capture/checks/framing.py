@@ -4,8 +4,10 @@ The board's camera is the photos' camera only if nothing changed between them. T
 points of it (SIFT, Lowe 2004) are found in the photo of the board and in the median of the photos, which has no moving
 shadows, and matched whatever their scale and turn. A similarity of the picture that explains them is a zoom or a turn
 of the photos (the camera's place is the same); a homography that explains more is the table's plane seen from elsewhere
-(Hartley and Zisserman 2004, section 13.1). Each is told by a Finding, whose homography leads from the pixels of the
-board's photo to those of the photos; calibration.reframed makes the photos' camera from it.
+(Hartley and Zisserman 2004, section 13.1). What explains hardly more matches than a picture that stands still is
+chance: of hundreds of matches on wood, a dozen agree on some similarity. Each motion is told by a Finding, whose
+homography leads from the pixels of the board's photo to those of the photos; calibration.reframed makes the photos'
+camera from it.
 """
 
 from collections.abc import Sequence
@@ -13,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from capture.checks.finding import Finding
 from capture.checks.picture_motion import Homography
@@ -36,7 +38,7 @@ DISTINCT = 0.85  # distance of the best match over that of the second best
 NEAR_PX = 2.0  # of LONG_SIDE: matches that a motion explains
 TRIALS = 5000  # of RANSAC
 FEWEST, SPREAD_PX = 12, 12.0  # matches that chance does not give; they lie that far apart (standard deviation) each way
-SIMPLER = 0.75  # of a homography's matches have to be those of a similarity, to be taken for one
+SIMPLER = 0.75  # of a homography's matches have to be those of a similarity, or of no motion, to be taken for one
 ZOOMED = 0.01  # smaller changes of scale come from focusing
 LARGEST_ZOOM = 3.0
 UPRIGHT_DEG = 1.0
@@ -209,12 +211,25 @@ def _framing(board: tuple, photos: tuple, factor: float) -> Framing | None:
     affine, near = cv2.estimateAffinePartial2D(
         seen, to, method=cv2.RANSAC, ransacReprojThreshold=NEAR_PX, maxIters=TRIALS
     )
-    best = _counted(None if affine is None else np.vstack([affine, [0, 0, 1]]), near, seen, to, factor)
+    found = _counted(None if affine is None else np.vstack([affine, [0, 0, 1]]), near, seen, to, factor)
     plane, near = cv2.findHomography(seen, to, cv2.RANSAC, NEAR_PX, maxIters=TRIALS)
     homography = _counted(plane, near, seen, to, factor)
-    if best is not None and (homography is None or best.matches >= SIMPLER * homography.matches):
-        return replace(best, is_similarity=True)
-    return homography
+    if found is not None and (homography is None or found.matches >= SIMPLER * homography.matches):
+        found = replace(found, is_similarity=True)
+    else:
+        found = homography
+    still = _still(seen, to)
+    if found is not None and len(np.unique(np.round(seen[still]), axis=0)) >= SIMPLER * found.matches:
+        return Framing(np.eye(3), int(still.sum()), True, seen[still], to[still], factor)
+    return found
+
+
+def _still(seen: Points, to: Points) -> Bool[np.ndarray, " matches"]:
+    """Return the matches of a picture that stands still, or nearly: many in one direction would be rare by chance."""
+    apart = to - seen
+    near = np.linalg.norm(apart, axis=1) <= AT_HOME * LONG_SIDE
+    middle = np.median(apart[near], axis=0) if near.any() else np.zeros(2)
+    return near & (np.linalg.norm(apart - middle, axis=1) <= NEAR_PX)
 
 
 def _counted(
