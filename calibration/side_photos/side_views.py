@@ -47,6 +47,16 @@ class SideResult:
 
 
 @dataclass(frozen=True)
+class _Whereabouts:
+    """Where the object can be, as its silhouette from the tripod says; world."""
+
+    outline: Float[np.ndarray, "n 3"]  # where rays through its pixels meet the ground
+    reach: Float[np.ndarray, "rays 3"]  # where rays that may meet it end
+    top: float  # above the ground
+    foot: Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True)
 class TripodObject:
     """What the tripod's photos say of the object before any light is known."""
 
@@ -88,11 +98,11 @@ def side_views(paths: Sequence[Path], board: Board, on_sheet: OnSheet, seen: Tri
     if len(outline) == 0:
         reason = "no object stands out in the tripod's photos, so nothing tells where to look for it"
         return [SideResult(path.name, None, reason) for path in paths]
-    reference, reach = read_photo(seen.board_photo), seen.reach()
-    tripod = _tripod(reference, seen)
+    reference = read_photo(seen.board_photo)
+    tripod, where = _tripod(reference, seen), _whereabouts(seen.posed_camera.centre, outline, seen.reach())
     results = []
     for path in paths:
-        found = _side_view(read_photo(path), reference, board, on_sheet, tripod, outline, reach)
+        found = _side_view(read_photo(path), reference, board, on_sheet, tripod, where)
         view, reason = (None, found) if isinstance(found, str) else (found, "")
         results.append(SideResult(path.name, view, reason))
     return results
@@ -143,14 +153,21 @@ def _tripod(reference: Photo, seen: TripodObject) -> TripodView:
     return TripodView(seen.posed_camera, reference.rgb, hides)
 
 
+def _whereabouts(
+    eye: Float[np.ndarray, "3"], outline: Float[np.ndarray, "n 3"], reach: Float[np.ndarray, "rays 3"]
+) -> _Whereabouts:
+    away = np.linalg.norm(outline[:, :2] - eye[:2], axis=1)
+    foot = outline[away <= np.percentile(away, NEAREST)].mean(0)
+    return _Whereabouts(outline, reach, most_height(eye, outline, reach), foot)
+
+
 def _side_view(
     photo: Photo,
     reference: Photo,
     board: Board,
     on_sheet: OnSheet,
     tripod: TripodView,
-    outline: Float[np.ndarray, "n 3"],
-    reach: Float[np.ndarray, "rays 3"],
+    where: _Whereabouts,
 ) -> SideView | str:
     camera, eye = tripod.posed_camera.camera, tripod.posed_camera.centre
     height, width = photo.rgb.shape[:2]
@@ -168,15 +185,12 @@ def _side_view(
     corners = find_board(grey_of(photo), board)
     if corners is None:
         return f"the board {board.spec()} was not found in it. Keep object and board in view, both in focus"
-    pose = side_pose(on_sheet(corners), camera, outline + LIFTED * (eye - outline))
+    pose = side_pose(on_sheet(corners), camera, where.outline + LIFTED * (eye - where.outline))
     if isinstance(pose, str):
         return pose
     view = PosedCamera(pose.camera, pose.world_from_camera, tripod.posed_camera.ground_height)
-    top = most_height(eye, outline, reach)
-    region = possible_region(view, reach, eye, top)
-    away = np.linalg.norm(outline[:, :2] - eye[:2], axis=1)
-    foot = outline[away <= np.percentile(away, NEAREST)].mean(0)
-    found = find_silhouette(photo.rgb, view, region, tripod, foot)
+    region = possible_region(view, where.reach, eye, where.top)
+    found = find_silhouette(photo.rgb, view, region, tripod, where.foot)
     if found is None:
         return "the object does not stand out from the table in it. Keep it in view, in even room light"
     if found.sure_outline() < LEAST_SURE:
@@ -184,7 +198,7 @@ def _side_view(
             f"only {found.sure_outline():.0%} of the object's outline is sure in it ({LEAST_SURE:.0%} needed): it "
             "looks like what lies behind it. Choose a side with a plainer background, in even room light"
         )
-    shown = share_shown(found, view, outline, eye, top)
+    shown = share_shown(found, view, where.outline, eye, where.top)
     if shown < LEAST_SHOWN:
         return (
             f"only {shown:.0%} of what the tripod saw of the object is found in it ({LEAST_SHOWN:.0%} needed): the "

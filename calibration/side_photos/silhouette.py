@@ -132,33 +132,51 @@ def find_silhouette(
         region: of possible_region.
         foot: world point on the table where the object stands: of several things there, that one is meant.
     """
-    found = _in_window(rgb, camera, region, tripod, foot)
+    found = _cut_out(rgb, camera, region, tripod, foot)
     if found is None:
         return None
     left, up, width, height = found.window
+    whole, near = np.zeros(region.shape, np.uint8), np.zeros_like(region)
     mask = cv2.resize(found.mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    pad = round(BESIDE_FOUND * max(np.ptp(rows), np.ptp(columns)))
-    near = np.zeros_like(region)
-    box = [
-        slice(max(start + int(at[0]) - pad, 0), start + int(at[-1]) + pad + 1)
-        for start, at in ((up, rows), (left, columns))
-    ]
-    near[*box] = True
-    return _in_window(rgb, camera, region & near, tripod, foot)
+    whole[up : up + height, left : left + width] = mask
+    left, up, width, height = _window(whole > 0, BESIDE_FOUND)
+    near[up : up + height, left : left + width] = True
+    found = _cut_out(rgb, camera, region & near, tripod, foot)
+    return None if found is None else Silhouette(found.mask, found.sure(), found.window)
 
 
-def _in_window(
+@dataclass(frozen=True)
+class _CutOut:
+    """What is found in a window, and what it is found by."""
+
+    window: tuple[int, int, int, int]
+    mask: Bool[np.ndarray, "height width"]
+    near: Bool[np.ndarray, "height width"]  # where the object may be
+    odds: Float[np.ndarray, "height width"]  # by deviation and colours
+    links: list[np.ndarray]
+    place: Float[np.ndarray, "2"]  # pixel of the foot
+    look: GroundLook
+
+    def sure(self) -> Bool[np.ndarray, "height width"]:
+        """Return where nothing else is found whoever is favoured, and neither shadow nor unseen table may mislead."""
+        more, less = (_cut(self.odds, self.links, self.near, favour) for favour in (FAVOUR, -FAVOUR))
+        # colours alone speak for the table, and an object has more than one
+        unseen = self.near & ~self.look.known & ~self.mask
+        apart = (_nearest(more, self.place) & ~self.mask) | (self.mask & ~less)
+        return ~(apart | _maybe_shade(self.mask, self.look) | unseen)
+
+
+def _cut_out(
     rgb: Float[np.ndarray, "height width 3"],
     camera: PosedCamera,
     region: Bool[np.ndarray, "height width"],
     tripod: TripodView,
     foot: Float[np.ndarray, "3"],
-) -> Silhouette | None:
-    window = _window(region)
-    if window is None:
+) -> _CutOut | None:
+    """Return what is found in a window around the region; None where nothing stands out. Args: of find_silhouette."""
+    if not region.any():
         return None
-    left, up, width, height = window
+    left, up, width, height = _window(region, AROUND, 4)
     scale = min(1.0, WINDOW / max(width, height))
     size = (max(16, round(width * scale)), max(16, round(height * scale)))
     part = cv2.resize(rgb[up : up + height, left : left + width], size, interpolation=cv2.INTER_AREA)
@@ -174,14 +192,10 @@ def _in_window(
             return None
         colours = _colour_odds(log, mask & (odds + colours >= 0), ~mask & (~near | (odds < -1)))
         mask = _nearest(_cut(odds + colours, links, near, 0.0), place)
-    both = odds + colours
-    more, less = (_cut(both, links, near, favour) for favour in (FAVOUR, -FAVOUR))
     mask = _to_half_way(mask, log, look)
     if mask.sum() < SMALLEST:
         return None
-    unseen = near & ~look.known & ~mask  # colours alone speak for the table, and an object has more than one
-    apart = (_nearest(more, place) & ~mask) | (mask & ~less) | _maybe_shade(mask, look) | unseen
-    return Silhouette(mask, ~apart, window)
+    return _CutOut((left, up, width, height), mask, near, odds + colours, links, place, look)
 
 
 def _to_half_way(
@@ -225,12 +239,14 @@ def _maybe_shade(mask: Bool[np.ndarray, "height width"], look: GroundLook) -> Bo
     return mask & (cv2.dilate(shade, np.ones((2 * BESIDE + 1, 2 * BESIDE + 1), np.uint8)) > 0)
 
 
-def _window(region: Bool[np.ndarray, "height width"]) -> tuple[int, int, int, int] | None:
-    """Return left, top, width and height of a window around the region."""
+def _window(region: Bool[np.ndarray, "height width"], beside: float, least: int = 0) -> tuple[int, int, int, int]:
+    """Return left, top, width and height of a window around a region that is not empty.
+
+    Args:
+        beside: how much more on each side, of the region's size, and `least`: px more than that.
+    """
     rows, columns = np.flatnonzero(region.any(1)), np.flatnonzero(region.any(0))
-    if len(rows) == 0:
-        return None
-    pad = round(AROUND * max(np.ptp(rows), np.ptp(columns))) + 4
+    pad = round(beside * max(np.ptp(rows), np.ptp(columns))) + least
     up, left = max(int(rows[0]) - pad, 0), max(int(columns[0]) - pad, 0)
     down, right = min(int(rows[-1]) + pad, region.shape[0] - 1), min(int(columns[-1]) + pad, region.shape[1] - 1)
     return left, up, right - left + 1, down - up + 1
