@@ -14,7 +14,9 @@ from reconstruct.initialization.shadow_mask import with_object_mask
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.outline import outline_of
 from reconstruct.labels.supervision import supervise
+from reconstruct.scene import ground_points
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import first_hits
 from reconstruct.solve.trials import hull_is_better, shadow_doubts
 
 LOOK = Look(width=120, height=90, n_lights=16, with_shadow=True)
@@ -70,3 +72,17 @@ def test_a_table_from_straight_above_begins_as_a_hull():
     assert (found & truth.mask).sum() > 0.9 * (found | truth.mask).sum()
     start = choose_start(scene, Observer(scene), FitConfig(), judge=hull_is_better)
     assert isinstance(start, HullStart)
+
+
+@pytest.mark.parametrize("shift", [1.5, -1.5])  # mm; a pixel is some 3 mm wide
+def test_the_labels_put_right_an_outline_that_is_off_by_half_a_pixel(table, shift):
+    scene, truth = table
+    whole = of(TABLE, truth)
+    shifted = SdfGrid(whole.values + shift, whole.origin, whole.spacing)
+    found = outline_of(scene, shifted, torch.ones_like(scene.shadow))
+    shown = found.mask.numpy() > 0.5
+    to_ground = torch.nan_to_num((ground_points(scene) - scene.eye).norm(dim=-1), nan=torch.inf)
+    rays = scene.directions.reshape(-1, 3)
+    seen = first_hits(shifted, scene.eye, rays, to_ground.ravel()).on_object.numpy().reshape(shown.shape)
+    before, after = (int((one != truth.mask).sum()) for one in (seen, shown))
+    assert after < 0.2 * before

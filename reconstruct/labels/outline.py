@@ -1,8 +1,8 @@
 """Clean object regions from likely object pixels, means over windows, and the outline as a surface's shadows show it.
 
 An outline that was found in shadow pictures is an estimate: a level top beside lit ground looks as that ground does. So
-near the outline a pixel stays undecided, and the shadows that the object throws decide, unless its own labels do: with
-each better surface, every pixel is tried as ground and as the object that the surface shows there.
+near the outline a pixel is as sure as its own labels make it, and the shadows that the object throws decide the rest:
+with each better surface, every pixel is tried as ground and as the object that the surface shows there.
 """
 
 import warnings
@@ -12,12 +12,14 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
 from skimage.filters import threshold_otsu
 from skimage.segmentation import random_walker
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate
+from torch.nn.functional import avg_pool2d, interpolate, normalize
 
 from calibration.ground.shadow_reach import shadow_reach
+from calibration.side_photos.min_cut import cheapest_region
 from reconstruct.scene import Scene, ground_points
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import first_hits, visibility
@@ -31,6 +33,13 @@ UNSURE = 0.02  # of the picture's longer side: so far from an outline that shado
 SHARPNESS = 8.0  # NeuS s per voxel of the surface that pixels are tried on
 SURELY = 0.1  # of the photos, and more than FEW: so many contradictions decide against a kind of pixel
 FEW = 2
+SOFT = 2.0  # NeuS s per voxel of the surface whose outline is tried: it may be off by half a voxel
+BESIDE = ((0, 0), (0, 1), (1, 0), (0, -1), (-1, 0))  # px: whose shadows a pixel near an outline may show, too
+FLIPPED = 0.02  # least share of the labels that may be wrong
+SURE = 50.0  # log of the odds
+FITS = 0.05  # of the labels, or one: what contradicts more is neither the object nor the ground
+LEAVES = 0.29  # confidence below reconstruct.labels.supervision.SURE_ENOUGH: matter goes by shadow rays alone
+LINK = 0.5  # log of the odds: what a pixel's side of an outline costs
 MATCHES = 2  # shadows that fall on a pixel as they would on ground
 LIT_QUANTILE = 0.8  # over photos: the value of a pixel when it is lit
 DARKEST = 1e-4  # linear: below, 8-bit photos hold only noise
@@ -59,8 +68,9 @@ def outline_of(scene: Scene, surface: SdfGrid, trust: Float[Tensor, "photos heig
     """Return the outline of a surface, decided where the shadow pictures contradict or confirm it.
 
     A pixel is surely object if its labels contradict the shadows that would fall on ground there, and not those on the
-    surface; surely ground if shadows fall on it as on ground. Other pixels stay undecided near the outline, and where
-    their labels contradict the surface.
+    surface; surely ground if shadows fall on it as on ground. Other pixels near the outline are what their labels make
+    likelier, see _odds_of_object, with an outline as short as these allow, and as sure as that; pixels whose labels
+    contradict the surface stay undecided.
 
     Args:
         scene: shadow pictures on a known ground.
@@ -83,9 +93,63 @@ def outline_of(scene: Scene, surface: SdfGrid, trust: Float[Tensor, "photos heig
     many, seen = max(FEW, SURELY * len(dark)), hit.reshape(shape).numpy()
     is_object = (on_ground > many) & (~seen | (on_object < on_ground))
     is_ground = (matches >= MATCHES) & (on_ground < FEW) & (~seen | (on_object > on_ground))
-    mask = np.where(is_object, True, np.where(is_ground, False, seen))
-    sure = is_object | is_ground | ~(_near_edge(seen) | (seen & (on_object > many)))
-    return Outline(torch.from_numpy(mask).float(), torch.from_numpy(sure).float())
+    near = _near_edge(seen)
+    rest = ~near & (seen | wanted.reshape(shape))
+    wrong = float(np.where(seen, on_object, on_ground)[rest].sum() / max(1, (asked[1] & rest).sum()))
+    tried = near & np.isfinite(to_ground.numpy()).reshape(shape)
+    odds = _odds_of_object(scene, surface, first.distance, (seen, tried), asked, max(FLIPPED, wrong))
+    odds = np.where(is_object, SURE, np.where(is_ground, -SURE, odds))
+    links = (np.full(one.shape, LINK) for one in (odds[:, 1:], odds[1:]))
+    mask = np.where(odds == 0, seen, cheapest_region(np.maximum(-odds, 0), np.maximum(odds, 0), *links))
+    unsure = near | (seen & (on_object > many))
+    partly = np.where(tried, np.tanh(np.abs(odds) / 2), 0) * np.where(seen & ~mask, LEAVES, 1)
+    confidence = np.where(is_object | is_ground | ~unsure, 1, partly)
+    return Outline(torch.from_numpy(mask).float(), torch.from_numpy(confidence).float())
+
+
+def _odds_of_object(
+    scene: Scene,
+    surface: SdfGrid,
+    distance: Float[Tensor, " pixels"],
+    where: tuple[Bool[np.ndarray, "height width"], Bool[np.ndarray, "height width"]],
+    asked: tuple[Bool[np.ndarray, "photos height width"], Bool[np.ndarray, "photos height width"]],
+    flipped: float,
+) -> Float[np.ndarray, "height width"]:
+    """Return log p(labels | object) - log p(labels | ground) near an outline, 0 where neither fits; +-SURE elsewhere.
+
+    log p(labels | X) = max over BESIDE of sum_k log p(label_k | X), with p of a lit label the transmittance from X to
+    light k. X is the ground, or the point as far away as the surface at the nearest pixel that sees it. The largest
+    counts, as shadows of either may be off by a pixel. A surface that is far off explains few labels either way.
+
+    Args:
+        distance: along each pixel's ray to the surface or the ground, world length.
+        where: pixels that see the surface, and pixels that are tried.
+        asked: per photo and pixel, if the label is dark, and if it is trusted.
+        flipped: share of the labels that may be wrong.
+    """
+    seen, tried = where
+    known = np.where(seen, SURE, -SURE)
+    if not tried.any():
+        return known
+    ground = ground_points(scene).reshape(-1, 3)
+    around = dilated(torch.from_numpy(tried), 3).numpy() & ground.isfinite().all(-1).numpy().reshape(seen.shape)
+    place = torch.from_numpy(np.flatnonzero(around))
+    nearest = np.asarray(distance_transform_edt(~seen, return_distances=False, return_indices=True))
+    away = torch.from_numpy(distance.numpy().reshape(seen.shape)[tuple(nearest)][around])
+    points = scene.eye + away[:, None] * scene.directions.reshape(-1, 3)[place]
+    points = points + surface.spacing * normalize(surface.gradient(points), dim=-1)
+    odds = np.zeros((2, len(BESIDE), *seen.shape))
+    for light, dark, trusted in zip(scene.lights, *asked, strict=True):
+        lights = light.expand(len(place), 4).contiguous()
+        for at, sums in zip((points, ground[place].contiguous()), odds, strict=True):
+            lit = np.full(seen.shape, 0.5)
+            lit[around] = visibility(surface, at, lights, SOFT / surface.spacing).numpy().clip(flipped, 1 - flipped)
+            for shift, own in zip(BESIDE, sums, strict=True):
+                shown = np.roll(lit, shift, (0, 1))
+                own += trusted * np.log(np.where(dark, 1 - shown, shown))
+    on_object, on_ground = odds.max(1)
+    fits = np.maximum(on_object, on_ground) > max(1.0, FITS * len(scene.lights)) * np.log(flipped)
+    return np.where(tried, np.where(fits, on_object - on_ground, 0), known)
 
 
 def _contradictions(
