@@ -46,6 +46,10 @@ CASES = {
     "rgb, 5 photos": Case(("--split", "train5")),
     "rgb, lights 3 %": Case(("--light-error", "0.03"), light_error=0.03),
     "rgb, lights 3 %, not refined": Case((), light_error=0.03),
+    "shadow, no mask, flips 2 %": Case(("--input", "shadow", "--mask", "none"), flips=0.02),
+    "shadow, no mask, lights 3 %": Case(
+        ("--input", "shadow", "--mask", "none", "--light-error", "0.03"), light_error=0.03
+    ),
     "shadow, lights 3 %": Case(("--input", "shadow", "--light-error", "0.03"), light_error=0.03),
     "shadow, flips 2 %": Case(("--input", "shadow"), flips=0.02),
 }
