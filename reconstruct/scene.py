@@ -63,6 +63,11 @@ class Scene:
     )
 
     @property
+    def tint(self) -> Float[Tensor, "photos 3"]:
+        """The lights' colours: their power over its mean over the channels."""
+        return self.power / self.power.mean(-1, keepdim=True)
+
+    @property
     def posed_camera(self) -> PosedCamera:
         """The camera of this grid above its ground."""
         return PosedCamera(self.camera, self.world_from_camera, self.ground_height)

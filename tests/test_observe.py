@@ -280,6 +280,19 @@ def test_parts_that_few_photos_light_belong_to_the_object_around_them(lights, le
     assert (mask & truth.mask).sum() > least * (mask | truth.mask).sum()
 
 
+@pytest.mark.parametrize("lights", [7, 8])
+def test_a_leg_of_another_colour_that_two_lights_reach_below_a_roof_is_object(lights):
+    roof, leg = Box((-45, -30, 45), (45, 30, 60)), Box((-10, -10, 0), (10, 10, 46))
+    look = Look(width=200, height=150, n_lights=lights, noise=0.002, ambient=0.02, seed=1)
+    (scene, truth), (_, without) = render((roof, leg), look), render((roof,), look)
+    shown = truth.mask & ~without.mask
+    assert (truth.visibility[:, shown].sum(0) <= 2).all()
+    painted = scene.rgb * torch.tensor([1.5, 1.0, 0.6])
+    rgb = torch.where(torch.from_numpy(shown)[..., None], painted, scene.rgb)
+    found = ground_module.test_ground(replace(scene, rgb=rgb)).mask.numpy() > 0.5
+    assert found[shown].mean() > 0.95 and not (found & ~truth.mask).any()
+
+
 def test_photos_too_dark_to_tell_light_from_noise_say_nothing_of_shadows():
     scene, truth = render(HEAP, PLAIN)
     dimmed = torch.where(torch.arange(20) % 2 == 0, 0.02, 1.0)  # every other light

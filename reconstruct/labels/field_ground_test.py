@@ -289,9 +289,8 @@ def _albedo(
 ) -> Float[Tensor, "height width 3"]:
     """Return colour over expected colour of the lit samples, all taken together; 0 where none is lit."""
     assert scene.rgb is not None
-    tint = scene.power / scene.power.mean(-1, keepdim=True)
     light = lit * torch.from_numpy(field.light - scale).exp()
-    expected = torch.einsum("khw,kc->hwc", light, tint)
+    expected = torch.einsum("khw,kc->hwc", light, scene.tint)
     return torch.einsum("khw,khwc->hwc", lit, scene.rgb) / expected.clamp(min=1e-12)
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from calibration.ground.ground_field import GroundField
-from reconstruct.labels.hue import has_other_hue
+from reconstruct.labels.ground_colour import brightest_albedo, ground_around, has_other_hue
 from reconstruct.labels.level_tops import find_level_tops
 from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.outline import (
@@ -36,6 +36,7 @@ NEVER_LIT = 0.25  # of the neighbours' albedo: a pixel of their hue whose third-
 GAP_SHADOW = 0.5  # of the photos: darker pixels that never outshine the ground may be ground in the gap at a contact
 FEWEST_AGREEING = 4  # lit samples that agree on the pixel's ground albedo; fewer may do so by chance
 GAP_CONFIDENCE = 0.2  # of the mask there
+PENUMBRA = 3  # px: such parts are wider
 FEWEST_SAMPLES = 3  # seen samples that a pixel needs to be classified
 RIM, RIM_SHARE = 2, 0.4  # px around a found mask, and the share of their confidence that ground labels keep there
 FAINTEST = 1e-4  # of the strongest light: fainter light is taken as this strong
@@ -281,8 +282,7 @@ def _gap(
     third = ratio.topk(min(3, len(ratio)), dim=0).values[-1]
     never_lit = (third < NEVER_LIT * near) & (between >= NOT_GROUND)
     if scene.rgb is not None and bool(never_lit.any()):
-        tint = scene.power / scene.power.mean(-1, keepdim=True)
-        never_lit &= ~has_other_hue(scene.rgb, tint, albedo, ground > 0, window)
+        never_lit &= ~has_other_hue(scene.rgb, scene.tint, albedo, ground > 0, window)
     shadow = (seen & (ratio < DARK_LEVEL * near)).sum(0)
     gap = (third < (1 + LIT_BAND) * near) & (shadow > GAP_SHADOW * seen.sum(0))
     return (seen.sum(0) >= FEWEST_SAMPLES) & ~never_lit, gap
@@ -295,7 +295,8 @@ def _mask(scene: Scene, pixels: _Behaviour) -> Outline:
     assert scene.rgb is not None
     likely = (pixels.between >= NOT_GROUND) & pixels.known
     region = object_region(likely, pixels.known)
-    region = object_region(region | _pockets(pixels, region), pixels.known)
+    few = (pixels.seen & ((pixels.relative - 1).abs() < LIT_BAND)).sum(0) < FEWEST_AGREEING
+    region = object_region(region | _pockets(scene, pixels, region, few), pixels.known)
     tops = find_level_tops(scene, pixels.relative, pixels.seen, pixels.albedo, region)
     region = object_region(region | tops.sure, pixels.known) if tops.sure.any() else region
     margin = (pixels.between - NOT_GROUND).abs() / NOT_GROUND
@@ -303,7 +304,7 @@ def _mask(scene: Scene, pixels: _Behaviour) -> Outline:
     reach = 2 * (max(region.shape) // 100) + 1
     rim = dilated(~region, reach)
     confidence = torch.where(pixels.gap & region & rim, torch.full_like(margin, GAP_CONFIDENCE), confidence)
-    share = _share_of_object(scene, pixels, region)
+    share = share_of_region(grey_of(scene.rgb) + 3 * NOISE_FLOOR, region, ~region & few)
     unsure = share.isfinite()
     region = torch.where(unsure, share > 0.5, region)
     confidence = torch.where(unsure, torch.minimum(confidence, (2 * share - 1).abs()), confidence)
@@ -311,32 +312,29 @@ def _mask(scene: Scene, pixels: _Behaviour) -> Outline:
     return Outline(coverage_at_edges(scene.rgb, region), confidence)
 
 
-def _share_of_object(
-    scene: Scene, pixels: _Behaviour, region: Bool[Tensor, "height width"]
-) -> Float[Tensor, "height width"]:
-    """Return the probability that a pixel shows the object where too few lit samples agree on ground; nan elsewhere.
+def _pockets(
+    scene: Scene, pixels: _Behaviour, region: Bool[Tensor, "height width"], few: Bool[Tensor, "height width"]
+) -> Bool[Tensor, "height width"]:
+    """Find parts of the object whose albedo, if they were ground, would differ from that of the ground around.
 
-    Two or three samples of a part of the object that few lights reach may agree with one ground albedo by chance.
+    They are bays of the region, which face up, and parts that few lights reach: of eight photos of a leg below a head
+    two were lit, and agreed with one albedo of the ground. Of those parts the brightest sample tells the albedo.
+
+    Args:
+        few: pixels of which so few lit samples agree with one albedo that these may do so by chance.
     """
     assert scene.rgb is not None
-    agreeing = (pixels.seen & ((pixels.relative - 1).abs() < LIT_BAND)).sum(0)
-    return share_of_region(grey_of(scene.rgb) + 3 * NOISE_FLOOR, region, ~region & (agreeing < FEWEST_AGREEING))
-
-
-def _pockets(pixels: _Behaviour, region: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """Find bays of the region whose albedo differs from the ground around: parts of the object that face up."""
     reach = 2 * (max(region.shape) // 60) + 1
     grown = dilated(region, reach)
     closed = ~dilated(~grown, reach)
     ground = ((pixels.between < DARK_LEVEL) & ~grown).float()
-    albedo = pixels.albedo.movedim(-1, 0)
-    window = 2 * (max(region.shape) // 16) + 1
-    sums = local_mean(torch.cat([ground * albedo, ground * albedo**2, ground[None]]), window)
-    count = sums[6].clamp(min=1e-6)
-    mean = sums[:3] / count
-    spread = (sums[3:6] / count - mean**2).clamp(min=0).sqrt()
-    strange = ((albedo - mean).abs() > torch.maximum(3 * spread, LIT_BAND * mean)).any(0)
-    return closed & ~region & strange & (sums[6] > 0)
+    mean, spread, known = ground_around(pixels.albedo, ground, 2 * (max(region.shape) // 16) + 1)
+    irradiance = scene.usable * pixels.lit_value / pixels.level.clamp(min=1e-12)
+    lit = brightest_albedo(scene.rgb, scene.tint, irradiance)
+    albedos = torch.stack([pixels.albedo, lit]).movedim(-1, 1)
+    bays, parts = ((albedos - mean).abs() > torch.maximum(3 * spread, LIT_BAND * mean)).any(1) & known & ~region
+    parts &= few & (lit.mean(-1) > SMALLEST_LIT_SHARE * mean.mean(0))  # else no light reaches it
+    return (bays & closed) | dilated(~dilated(~parts, PENUMBRA), PENUMBRA)
 
 
 def _visibility(
@@ -383,9 +381,8 @@ def _albedo(
 ) -> Float[Tensor, "height width 3"]:
     """Colour over expected colour of the lit samples, all taken together."""
     assert scene.rgb is not None
-    tint = scene.power / scene.power.mean(-1, keepdim=True)
     direct = (gain * samples.expected.reshape(lit.shape) - scene.ambient.mean()).clamp(min=0)
-    expected = torch.einsum("khw,kc->hwc", lit * direct, tint) + lit.sum(0)[..., None] * scene.ambient
+    expected = torch.einsum("khw,kc->hwc", lit * direct, scene.tint) + lit.sum(0)[..., None] * scene.ambient
     return torch.einsum("khw,khwc->hwc", lit, scene.rgb) / expected.clamp(min=1e-12)
 
 

@@ -168,8 +168,7 @@ def _write_together(
     row, column = places.unbind(1)
     bright = pixels.usable * pixels.value / pixels.strength
     bright = (bright / bright.amax(1, keepdim=True).clamp(min=1e-12)) ** 2
-    tint = scene.power / scene.power.mean(-1, keepdim=True)
-    seen = torch.einsum("nk,knc->nc", bright, scene.rgb[:, row, column] / tint[:, None])
+    seen = torch.einsum("nk,knc->nc", bright, scene.rgb[:, row, column] / scene.tint[:, None])
     picture = Picture(places, scene.directions, seen / seen.sum(-1, keepdim=True).clamp(min=1e-12))
     guess = None if normals is None else normals[row, column]
     joint, weight = fit_together(picture, pixels, guess, solved)
@@ -388,8 +387,7 @@ def _colour(scene: Scene, pixels: Pixels, places: Tensor, normal: Tensor, weight
     assert scene.rgb is not None
     row, column = places.unbind(1)
     cosine = (pixels.towards @ normal[..., None])[..., 0].clamp(min=0)
-    tint = scene.power / scene.power.mean(-1, keepdim=True)
-    expected = torch.einsum("nk,kc->nc", weight * pixels.strength * cosine, tint)
+    expected = torch.einsum("nk,kc->nc", weight * pixels.strength * cosine, scene.tint)
     expected = expected + weight.sum(1, keepdim=True) * scene.ambient
     expected = expected + (weight * (indirect_light(pixels, normal) - pixels.ambient)).sum(1, keepdim=True)
     seen = torch.einsum("nk,knc->nc", weight, scene.rgb[:, row, column])

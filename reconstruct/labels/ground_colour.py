@@ -1,0 +1,69 @@
+"""Tell the object from the ground by colour: by hue in the dark, since shadows keep it, and by albedo in the light."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from reconstruct.labels.outline import local_mean
+
+OTHER_HUE = 0.4  # largest difference of log(channel / mean); light from a coloured object beside tints half as much
+BRIGHTEST = 3  # samples of a pixel that its colour is taken from
+DARKEST = 1e-3  # linear: of darker pixels the hue is noise
+FAINTEST = 1e-2  # of the mean of the channels: a fainter channel is taken as this
+
+
+def has_other_hue(
+    rgb: Float[Tensor, "photos height width 3"],
+    tint: Float[Tensor, "photos 3"],
+    albedo: Float[Tensor, "height width 3"],
+    ground: Bool[Tensor, "height width"],
+    window: int,
+) -> Bool[Tensor, "height width"]:
+    """Return the pixels whose hue is not that of the ground around them, whatever light reaches them.
+
+    Args:
+        tint: the lights' colours, over which a photo's colour is that of a surface.
+        albedo: of the ground.
+        ground: pixels that are ground.
+        window: px, odd: how far around a pixel ground is asked.
+    """
+    brightest = rgb.mean(-1).topk(min(BRIGHTEST, len(rgb)), dim=0).indices
+    own = torch.stack([torch.gather(rgb[..., c] / tint[:, c, None, None], 0, brightest).mean(0) for c in range(3)])
+    near = local_mean((albedo * ground[..., None]).movedim(-1, 0), window)
+    own_hue, near_hue = ((image / image.mean(0).clamp(min=DARKEST)).clamp(min=FAINTEST).log() for image in (own, near))
+    return (near.mean(0) > DARKEST) & (own.mean(0) > DARKEST) & ((own_hue - near_hue).abs().amax(0) > OTHER_HUE)
+
+
+def ground_around(
+    albedo: Float[Tensor, "height width 3"], ground: Float[Tensor, "height width"], window: int
+) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "3 height width"], Bool[Tensor, "height width"]]:
+    """Return mean and spread (one sigma) of the ground's albedo around each pixel, and where there is any.
+
+    Args:
+        albedo: as if every pixel were ground.
+        ground: 1 where a pixel is ground, else 0.
+        window: px, odd: how far around a pixel ground is asked.
+    """
+    channels = albedo.movedim(-1, 0)
+    sums = local_mean(torch.cat([ground * channels, ground * channels**2, ground[None]]), window)
+    count = sums[6].clamp(min=1e-6)
+    mean = sums[:3] / count
+    return mean, (sums[3:6] / count - mean**2).clamp(min=0).sqrt(), sums[6] > 0
+
+
+def brightest_albedo(
+    rgb: Float[Tensor, "photos height width 3"],
+    tint: Float[Tensor, "photos 3"],
+    irradiance: Float[Tensor, "photos height width"],
+) -> Float[Tensor, "height width 3"]:
+    """Return each pixel's albedo as the photo shows it that makes it brightest: where few lights reach, the lit one.
+
+    0 where no sample is usable.
+
+    Args:
+        tint: the lights' colours over their mean.
+        irradiance: of the lit ground, grey; 0 where a sample is unusable.
+    """
+    at = torch.where(irradiance > 0, rgb.mean(-1) / irradiance.clamp(min=1e-12), 0.0).argmax(0, keepdim=True)
+    brightest, expected = rgb.gather(0, at[..., None].expand(-1, -1, -1, 3))[0], irradiance.gather(0, at)[0][..., None]
+    return torch.where(expected > 0, brightest / (expected * tint[at[0]]).clamp(min=1e-12), 0.0)
