@@ -1,6 +1,7 @@
 """All lights from outlines and shading together: the search from rough starts, and the motion that outlines leave free,
 which the shading of all photos decides."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -23,6 +24,7 @@ from calibration.flashlight.model import (
 from calibration.outlines.terms import OutlineTerms
 from capture.checks.robust import spread
 
+LOG = logging.getLogger(__name__)
 AIM_ROUNDS = 2  # of looking for aims, each with the beam that the last one's aims gave
 LEAST_SHARE = 0.2  # of a light's height that a motion leaves
 USUAL_MISFIT = 0.03  # log units, before it is measured
@@ -61,7 +63,10 @@ def searched(starts: list[Float[np.ndarray, "photos 3"]], evidence: Evidence) ->
     """
     assert evidence.outlines is not None
     trusted = _trusted(evidence, USUAL_MISFIT)
-    first = [_pass(one, evidence, USUAL_MISFIT, None, FREE_AIMS) for one in starts]
+    first = []
+    for number, one in enumerate(starts):
+        LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", number + 1, len(starts))
+        first.append(_pass(one, evidence, USUAL_MISFIT, None, FREE_AIMS))
     order = np.argsort(_posteriors(first, trusted))[:FOLLOWED]
     found = [_followed(first[number], evidence) for number in order]
     posterior = _posteriors(found, trusted)
@@ -76,12 +81,14 @@ def searched(starts: list[Float[np.ndarray, "photos 3"]], evidence: Evidence) ->
 def _followed(found: _Found, evidence: Evidence) -> _Found:
     """Return the best of further passes of the search."""
     trusted = _trusted(evidence, USUAL_MISFIT)
-    for _ in range(PASSES):
+    for number in range(PASSES):
+        LOG.info("improving lights from outlines of shadows and shading, pass %d of at most %d", number + 1, PASSES)
         further = _again(found, evidence, FREE_AIMS)
         before, after = _posteriors([found, further], trusted)
         found = further if after < before else found
         if before - after < GAIN:
             break
+    LOG.info("improving lights from outlines of shadows and shading, with all beams aimed alike")
     alike = _again(found, evidence, NARROW_AIMS)
     tried = [found, alike, _again(alike, evidence, FREE_AIMS)]
     return tried[int(_posteriors(tried, trusted).argmin())]
@@ -172,7 +179,10 @@ def at_best_contrast(start: Flashlights, evidence: Evidence, contrasts: tuple[fl
         contrasts: that are tried; 1 alone where the photos are linear.
     """
     assert evidence.outlines is not None
-    found = [_joint(start.positions, _flattened(evidence, one), USUAL_MISFIT, LOOSE, start) for one in contrasts]
+    found = []
+    for number, one in enumerate(contrasts):
+        LOG.info("fitting the lights under contrast %d of %d", number + 1, len(contrasts))
+        found.append(_joint(start.positions, _flattened(evidence, one), USUAL_MISFIT, LOOSE, start))
     shown = [(cost, fit, one * misfit) for one, (cost, fit, misfit) in zip(contrasts, found, strict=True)]
     surprise = np.log(contrasts) / CONTRAST_WIDTH
     cost = _posteriors(shown, evidence) + 0.5 * surprise**2  # of the misfit in the pictures

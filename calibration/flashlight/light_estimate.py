@@ -1,5 +1,6 @@
 """Turn fitted flashlights into lights with power in colour, a realistic uncertainty and a verdict per photo."""
 
+import logging
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -43,6 +44,7 @@ from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
 from capture.photos.photo import PhotoStack
 
+LOG = logging.getLogger(__name__)
 OTHER_POWER = 3.0  # factor between one flashlight's power in two photos
 POWER_SIGMAS = 6.0  # or in how much the other photos differ, where they do not tell their exposure
 LOWEST = 0.08  # of the camera's distance: no hand holds a flashlight lower
@@ -272,9 +274,11 @@ def locate_lights(
     Raises:
         CalibrationError: fewer than 4 photos or lights, or too little bare ground in view.
     """
+    LOG.info("reading the ground's light in %d photos", usable.sum())
     evidence, photos = collect(stack, posed_camera, usable)
     edges = ground_ends(stack, posed_camera, usable)
     evidence = before_ends(evidence, edges)
+    LOG.info("fitting the lights to the ground's shading")
     fit = without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent))
     fit = with_oval_beams(refit_outliers(fit), evidence)
     names = [stack.paths[k].name for k in photos]

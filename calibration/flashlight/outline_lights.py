@@ -6,6 +6,7 @@ the shading of all photos together decides them (common_motion). Both are fitted
 shading trusted only as far as its own misfit allows. Photos whose shadows the picture cuts are located last.
 """
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from operator import itemgetter
@@ -52,6 +53,7 @@ from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
 from capture.photos.photo import PhotoStack
 
+LOG = logging.getLogger(__name__)
 OUTLINE_SIDE = 504  # px: grain and noise of larger pictures make outlines ragged, smaller ones make them coarse
 THIN = 4  # every fourth ground cell: misfits are smooth over many
 LIT = 0.85  # visibility from which a cell's brightness counts
@@ -83,6 +85,7 @@ def with_outlines(
         edges: where the ground ends, world: no shadow beyond them is looked at.
         cues: photos from the side, a height: they fix the numbers that outlines leave free.
     """
+    LOG.info("looking for shadows on the ground")
     coarse, field, shadows = _ground_and_shadows(stack, posed_camera, photos, edges)
     terms = _terms(coarse, field, shadows, posed_camera, cues)
     if terms is None:
@@ -219,7 +222,8 @@ def _located(
     terms, flashlights = fit.evidence.outlines, fit.flashlights
     assert terms is not None
     cut = _cut(fit)
-    for k in np.flatnonzero(strays).tolist():
+    for number, k in enumerate(np.flatnonzero(strays).tolist()):
+        LOG.info("placing lights whose shadows are cut or contradict the others, %d of %d", number + 1, strays.sum())
         alone = ~strays | (np.arange(len(strays)) == k)
         places = flashlights.positions
         likely = likely_places(replace(terms, trusted=alone), places, k, np.stack([start[k], places[k]]))

@@ -37,6 +37,7 @@ from reconstruct.run.results import save_results, save_views_maps
 from reconstruct.run.solve_stage import AllPhotos, solve
 from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder, content_hash
 from reconstruct.run_folder.once import Lazy, ResultFile, done_once, once
+from reconstruct.run_folder.progress import told
 from reconstruct.solve.backend import backend_name, solver_device
 from reconstruct.source.calibrate_source import calibrate_source_views
 from reconstruct.source.memory import Plan, keep_spread, read_plan
@@ -237,7 +238,8 @@ def refuse_device(options: RunOptions) -> None:
 
 def _calibrated(source: Source, photos: AllPhotos, options: RunOptions, run: RunFolder) -> CalibratedViews:
     """Stage "calibrate"; small photos are named anew if the first view is left out."""
-    found, views = calibrate_source_views(source, photos, options), source.views()
+    with told("calibration", run.activity):
+        found, views = calibrate_source_views(source, photos, options), source.views()
     if len(views) > 1 and views[0].capture is not None and views[0].capture.name != found.views[0].name:
         write_thumbnails(source, run, found.views[0].name)
     return found

@@ -1,7 +1,10 @@
-"""Connect the progress callback of exports and films to a progress display."""
+"""Connect the progress of exports and films, and what packages log of their steps, to a progress display."""
 
+import logging
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from reconstruct.export.export import OnProgress
 from reconstruct.run_folder.folder import Progress
@@ -17,3 +20,32 @@ def progress(stage: str, show: Callable[[Progress], object]) -> OnProgress:
         show(Progress(passed, time.process_time(), stage, done, total, eta, message))
 
     return on_progress
+
+
+class _Told(logging.Handler):
+    """Hands on what one thread logs."""
+
+    def __init__(self, say: Callable[[str], None]):
+        super().__init__(logging.INFO)
+        self._say, self._thread = say, threading.get_ident()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.thread == self._thread:
+            self._say(record.getMessage())
+
+
+@contextmanager
+def told(package: str, say: Callable[[str], None]) -> Iterator[None]:
+    """Say what a package logs of its steps, as long as this lasts; of this thread alone, as runs may be side by side.
+
+    Args:
+        package: name of its logger.
+    """
+    logger, handler = logging.getLogger(package), _Told(say)
+    if logger.getEffectiveLevel() > logging.INFO:
+        logger.setLevel(logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
