@@ -52,10 +52,8 @@ def ground_around(
 
 
 def brightest_albedo(
-    rgb: Float[Tensor, "photos height width 3"],
-    tint: Float[Tensor, "photos 3"],
-    irradiance: Float[Tensor, "photos height width"],
-) -> Float[Tensor, "height width 3"]:
+    rgb: Float[Tensor, "photos n 3"], tint: Float[Tensor, "photos 3"], irradiance: Float[Tensor, "photos n"]
+) -> Float[Tensor, "n 3"]:
     """Return each pixel's albedo as the photo shows it that makes it brightest: where few lights reach, the lit one.
 
     0 where no sample is usable.
@@ -65,5 +63,5 @@ def brightest_albedo(
         irradiance: of the lit ground, grey; 0 where a sample is unusable.
     """
     at = torch.where(irradiance > 0, rgb.mean(-1) / irradiance.clamp(min=1e-12), 0.0).argmax(0, keepdim=True)
-    brightest, expected = rgb.gather(0, at[..., None].expand(-1, -1, -1, 3))[0], irradiance.gather(0, at)[0][..., None]
+    brightest, expected = rgb.gather(0, at[..., None].expand(-1, -1, 3))[0], irradiance.gather(0, at)[0][:, None]
     return torch.where(expected > 0, brightest / (expected * tint[at[0]]).clamp(min=1e-12), 0.0)

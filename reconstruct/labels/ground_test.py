@@ -329,8 +329,9 @@ def _pockets(
     closed = ~dilated(~grown, reach)
     ground = ((pixels.between < DARK_LEVEL) & ~grown).float()
     mean, spread, known = ground_around(pixels.albedo, ground, 2 * (max(region.shape) // 16) + 1)
-    irradiance = scene.usable * pixels.lit_value / pixels.level.clamp(min=1e-12)
-    lit = brightest_albedo(scene.rgb, scene.tint, irradiance)
+    irradiance = scene.usable[:, few] * pixels.lit_value[:, few] / pixels.level[few].clamp(min=1e-12)
+    lit = torch.zeros_like(pixels.albedo)
+    lit[few] = brightest_albedo(scene.rgb[:, few], scene.tint, irradiance)
     albedos = torch.stack([pixels.albedo, lit]).movedim(-1, 1)
     bays, parts = ((albedos - mean).abs() > torch.maximum(3 * spread, LIT_BAND * mean)).any(1) & known & ~region
     parts &= few & (lit.mean(-1) > SMALLEST_LIT_SHARE * mean.mean(0))  # else no light reaches it
