@@ -1,6 +1,6 @@
 """Photographed figures under known distant lights, without a ground: their normals, and photos that no run saw.
 
-    python benchmarks/run_figures.py SET... [--preset standard] [--left-out 8] [--table FILE]
+    python benchmarks/run_figures.py SET... [--preset standard] [--left-out 8] [--seed 0] [--table FILE]
 
 A SET is a folder as DiLiGenT has them: 16-bit linear PNGs, filenames.txt, light_directions.txt, light_intensities.txt,
 mask.png and, for scoring only, Normal_gt.mat. A first run takes all photos: the angle between its normal.npy and the
@@ -34,10 +34,11 @@ LISTS = ("filenames.txt", "light_directions.txt", "light_intensities.txt")
 PEAK = 0.999
 
 
-def ran(folder: Path, preset: str, out: Path) -> float:
+def ran(folder: Path, options: argparse.Namespace, out: Path) -> float:
     """Run a folder and return its CPU seconds."""
     before = cpu_seconds()
-    command = [sys.executable, "-m", "shadowgraph", "run", str(folder), "--preset", preset, "--viewer", "off"]
+    command = [sys.executable, "-m", "shadowgraph", "run", str(folder), "--preset", options.preset, "--viewer", "off"]
+    command += ["--seed", str(options.seed)]
     subprocess.run([*command, "--out", str(out)], cwd=ROOT, check=True)
     return cpu_seconds() - before
 
@@ -102,8 +103,8 @@ def rows(options: argparse.Namespace) -> Iterator[dict]:
             names = (folder / LISTS[0]).read_text().split()
             left_out = [names[int((k + 0.5) * len(names) / options.left_out)] for k in range(options.left_out)]
             whole, part = Path(temporary) / "whole", Path(temporary) / "part"
-            spent = ran(without(folder, [], Path(temporary) / folder.name), options.preset, whole)
-            ran(without(folder, left_out, Path(temporary) / f"{folder.name}_part"), options.preset, part)
+            spent = ran(without(folder, [], Path(temporary) / folder.name), options, whole)
+            ran(without(folder, left_out, Path(temporary) / f"{folder.name}_part"), options, part)
             scores = angles(folder, whole) | relit(folder, left_out, whole, part)
             yield {"set": folder.name, "photos": len(names)} | scores | {"CPU s": spent}
 
@@ -114,9 +115,10 @@ def main() -> None:
     parser.add_argument("sets", nargs="+", type=Path)
     parser.add_argument("--preset", default="standard")
     parser.add_argument("--left-out", type=int, default=8)
+    parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     note = f"Preset {options.preset}; {options.left_out} photos left out of the second run."
-    Sheet("Figures under known distant lights", options.table, "seed 0", note).fill(rows(options), "set")
+    Sheet("Figures under known distant lights", options.table, f"seed {options.seed}", note).fill(rows(options), "set")
 
 
 if __name__ == "__main__":
