@@ -75,9 +75,11 @@ def check(command: Check, console: Console) -> None:
         console.print(reading, markup=False, highlight=False)
         from reconstruct.check.readiness import refuse_hopeless  # after the refusals, which need no torch
         from reconstruct.check.verdict import read_and_check
+        from reconstruct.run_folder.progress import told
         from viewer.report.check_page import check_lines, write_check
 
-        checked = read_and_check(source, options)
+        with told("calibration", display.activity):
+            checked = read_and_check(source, options)
     out = results_folder(command)
     written = write_check(checked, out)
     write_json(out / "check.json", checked.document())

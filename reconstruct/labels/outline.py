@@ -138,18 +138,19 @@ def _odds_of_object(
     away = torch.from_numpy(distance.numpy().reshape(seen.shape)[tuple(nearest)][around])
     points = scene.eye + away[:, None] * scene.directions.reshape(-1, 3)[place]
     points = points + surface.spacing * normalize(surface.gradient(points), dim=-1)
-    odds = np.zeros((2, len(BESIDE), *seen.shape))
+    rows, columns = np.nonzero(tried)
+    beside = [((rows - down) % len(seen), (columns - right) % seen.shape[1]) for down, right in BESIDE]
+    odds = np.zeros((2, len(BESIDE), len(rows)))
     for light, dark, trusted in zip(scene.lights, *asked, strict=True):
-        lights = light.expand(len(place), 4).contiguous()
         for at, sums in zip((points, ground[place].contiguous()), odds, strict=True):
             lit = np.full(seen.shape, 0.5)
-            lit[around] = visibility(surface, at, lights, SOFT / surface.spacing).numpy().clip(flipped, 1 - flipped)
-            for shift, own in zip(BESIDE, sums, strict=True):
-                shown = np.roll(lit, shift, (0, 1))
-                own += trusted * np.log(np.where(dark, 1 - shown, shown))
+            lit[around] = _transmittance(surface, light, at, SOFT).clip(flipped, 1 - flipped)
+            for shown, own in zip(beside, sums, strict=True):
+                own += trusted[tried] * np.log(np.where(dark[tried], 1 - lit[shown], lit[shown]))
     on_object, on_ground = odds.max(1)
     fits = np.maximum(on_object, on_ground) > max(1.0, FITS * len(scene.lights)) * np.log(flipped)
-    return np.where(tried, np.where(fits, on_object - on_ground, 0), known)
+    known[tried] = np.where(fits, on_object - on_ground, 0)
+    return known
 
 
 def _contradictions(
@@ -202,9 +203,15 @@ def _shadow(
 ) -> Bool[np.ndarray, "height width"]:
     """Return the shadow that a surface casts on the points of the pixels in `where`; as seen on the others."""
     shadow = seen.copy().ravel()
-    lights = light.expand(len(points), 4).contiguous()
-    shadow[where] = visibility(surface, points, lights, SHARPNESS / surface.spacing).numpy() < 0.5
+    shadow[where] = _transmittance(surface, light, points, SHARPNESS) < 0.5
     return shadow.reshape(seen.shape)
+
+
+def _transmittance(
+    surface: SdfGrid, light: Float[Tensor, "4"], points: Float[Tensor, "n 3"], per_voxel: float
+) -> Float[np.ndarray, " n"]:
+    """Return the transmittance from points, world, to one light. `per_voxel`: NeuS s."""
+    return visibility(surface, points, light.expand(len(points), 4).contiguous(), per_voxel / surface.spacing).numpy()
 
 
 def _contradicts(
