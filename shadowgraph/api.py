@@ -40,7 +40,7 @@ def run(capture: str | Path, out: str | Path | None = None, *, quiet: bool = Fal
 def _check_choices(settings: Mapping[str, Any]) -> None:
     """Refuse settings that the command line would refuse."""
     hints = get_type_hints(Run) | get_type_hints(ReconstructResearch)
-    known = [name for name in hints if name not in ("capture", "out", "viewer", "for_research")]
+    known = [name for name in hints if name not in ("capture", "out", "viewer", "research")]
     unknown = sorted(set(settings) - set(known))
     if unknown:
         raise TypeError(f"shadowgraph.run has no setting {unknown[0]!r}; {', '.join(known)} are known.")

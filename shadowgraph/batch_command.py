@@ -6,9 +6,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
 from capture.errors import CaptureError
+from shadowgraph.options import Flag, Given
 
 if TYPE_CHECKING:
     from reconstruct.run.batch import Outcome
@@ -24,17 +25,17 @@ class Batch:
     """Folder for the results: a run for each capture, index.html, batch.json."""
     jobs: int = 1
     """Captures at a time on this machine; each takes its share of the cores, and memory as `doctor` says."""
-    ray: str | None = None
+    ray: Given[str] = None
     """Run on a Ray cluster instead, whose machines see the same folders: auto, HOST:PORT, ray://HOST:PORT, or local."""
-    threads: int | None = None
+    threads: Given[int] = None
     """Cores for each capture; all of this machine over --jobs unless given."""
     preset: Literal["draft", "standard", "fine", "paper"] = "standard"
     """As for `run`."""
-    board: str | None = None
+    board: Given[str] = None
     """The printed board of all captures, as for `run`, where they do not say it themselves."""
     seed: int = 0
     """As for `run`."""
-    debug: FlagCreatePairsOff[bool] = False
+    debug: Flag = False
     """Show the traceback of an error."""
 
 

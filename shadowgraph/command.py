@@ -17,6 +17,7 @@ import tyro
 from rich.console import Console
 
 from capture.errors import UserError
+from capture.files.names import refuse_no_folder
 from shadowgraph.batch_command import Batch, do_batch
 from shadowgraph.export_command import Export, Relight, do_export, do_relight
 from shadowgraph.faults import Terminated, say_fault, sentence_for, sigterm_as_ctrl_c
@@ -71,7 +72,10 @@ def _import(command: Import, console: Console) -> None:
 
 def _evaluate(command: Evaluate, console: Console) -> None:
     from reconstruct.evaluate.metrics import evaluate
+    from reconstruct.stored_run.refusal import refuse_no_run
 
+    refuse_no_run(command.run)
+    refuse_no_folder(command.reference, "the folder that holds the truth")
     print(json.dumps(evaluate(command.run, command.reference), indent=1))
 
 
@@ -83,8 +87,10 @@ def _report(command: Report, console: Console) -> None:
         names = write_bundle(command.run, command.bundle, command.with_pictures)
         line = f"{command.bundle} written: {', '.join(names)}. Look into it before you send it."
     else:
+        from reconstruct.stored_run.refusal import refuse_no_run
         from viewer.report.report import write_report
 
+        refuse_no_run(command.run)
         line = f"{write_report(command.run)} written"
     print_lines(console, line)
 
@@ -171,7 +177,7 @@ def main(arguments: list[str] | None = None) -> int:
         prog="shadowgraph",
         description="3D from shadows: photos under a moving flashlight become a mesh that can be relit.",
         args=given or ["studio"],
-        config=(tyro.conf.OmitSubcommandPrefixes,),
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.DisallowNone),
     )
     if not command.debug:
         sys.excepthook = say_fault

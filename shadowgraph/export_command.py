@@ -6,17 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
 from capture.errors import CaptureError
 from reconstruct.export.export import ExportOptions, export, format_for, save
 from reconstruct.export.formats import DATASETS
 from reconstruct.run_folder.folder import Progress
 from reconstruct.run_folder.progress import progress
+from reconstruct.stored_run.refusal import refuse_no_run
+from shadowgraph.options import Flag, Given
 from viewer.report.formats import FORMATS
 
 RunFolder = Annotated[Positional[Path], arg(metavar="RUN")]
-Flag = FlagCreatePairsOff[bool]
 FORMAT_NAMES = ", ".join(FORMATS)
 
 
@@ -26,23 +27,23 @@ class Export:
 
     run: RunFolder
     """The folder of a finished run."""
-    file: Annotated[Positional[Path | None], arg(metavar="FILE")] = None
+    file: Annotated[Positional[Path | None], arg(metavar="FILE", help_behavior_hint="")] = None
     """The file to write; RUN/exports/... unless given. Its ending chooses the format unless --format does."""
-    format: Annotated[str | None, arg(metavar=f"{{{FORMAT_NAMES}}}")] = None
+    format: Annotated[Given[str], arg(metavar=f"{{{FORMAT_NAMES}}}")] = None
     """What to save."""
-    faces: int | None = None
+    faces: Given[int] = None
     """Triangles to reduce the mesh to; 30000 with pictures on it, all of them for printing and measuring."""
-    texture: int | None = ExportOptions.texture
+    texture: Given[int] = ExportOptions.texture
     """Size of the pictures on the mesh, px; 1024 unless given, or as fine as the run's detail is, up to 4096."""
-    width: int | None = None
+    width: Given[int] = None
     """Width of pictures and videos, px."""
     frames: int = ExportOptions.frames
     """Pictures in a video of one turn; 30 are a second."""
-    lamp_size: float | None = None
+    lamp_size: Given[float] = None
     """Radius of the lamp in pictures and videos, mm (or units of the scene); a larger lamp casts softer shadows."""
-    print_size: float | None = None
+    print_size: Given[float] = None
     """Longest side of what is printed (3mf, stl), mm; as large as the object unless given."""
-    photos: Path | None = None
+    photos: Given[Path] = None
     """For shadowneus, rti, colmap and nerf: the capture's folder, to export its photos. Without it, computed
     pictures are exported. A FILE without an ending is a folder, else a .zip."""
     debug: Flag = False
@@ -55,17 +56,17 @@ class Relight:
 
     run: RunFolder
     """The folder of a finished run."""
-    light: Annotated[str | None, arg(metavar="X,Y,Z")] = None
+    light: Annotated[Given[str], arg(metavar="X,Y,Z")] = None
     """Place of a lamp in the world of the run, mm (or units of the scene), z up."""
-    direction: Annotated[str | None, arg(metavar="X,Y,Z")] = None
+    direction: Annotated[Given[str], arg(metavar="X,Y,Z")] = None
     """Towards a far lamp, in the same world."""
-    env: Path | None = None
+    env: Given[Path] = None
     """An environment map that lights it from all sides: .hdr or .exr."""
-    orbit: int | None = None
+    orbit: Given[int] = None
     """Make a video with this many places of the lamp around the object."""
-    out: Path | None = None
+    out: Given[Path] = None
     """The file to write: .png or .exr (linear), .mp4, .webm or .gif; in RUN/exports unless given."""
-    width: int | None = None
+    width: Given[int] = None
     """Width, px; that of the working picture unless given."""
     rotate: float = 0.0
     """Degrees by which the environment map is turned, from +x towards +y."""
@@ -81,6 +82,7 @@ def do_relight(command: Relight, say: Callable[[str], object], show: Callable[[P
     """Make the picture or video that was asked for, and say what is in it."""
     from reconstruct.export.relit import NewLight, read_relit, relit_file, write_relit
 
+    refuse_no_run(command.run)
     new = NewLight(
         _three(command.light, "--light"),
         _three(command.direction, "--direction"),
@@ -101,6 +103,7 @@ def do_relight(command: Relight, say: Callable[[str], object], show: Callable[[P
 
 def do_export(command: Export, say: Callable[[str], object], show: Callable[[Progress], object]) -> None:
     """Write the file or folder that was asked for, and say what is in it."""
+    refuse_no_run(command.run)
     sizes = (command.faces, command.texture, command.width, command.frames, command.lamp_size)
     options = ExportOptions(*sizes, command.photos, command.print_size)
     name = format_for(command.file, command.format)

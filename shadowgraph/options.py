@@ -4,7 +4,7 @@
 
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
@@ -17,7 +17,10 @@ Ablation = Literal[
     "intersection", "boundary", "expected-depth", "foreground-only", "background-only", "sampled", "telescoped"
 ]
 Device = Literal["auto", "cpu", "cuda", "torch-cpu"]
-Flag = FlagCreatePairsOff[bool]
+T = TypeVar("T")
+UNSAID = arg(help_behavior_hint="")  # no "(default: None)": the sentence before says what happens
+Given = Annotated[T | None, UNSAID]  # an option that need not be given
+Flag = Annotated[FlagCreatePairsOff[bool], UNSAID]
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class ReconstructResearch(CalibrateResearch):
     field: Field = "auto"
     """What represents the surface. auto and grid: the default solver's grid; neural: the paper's network; hash: hash
     features and a small network. With --preset paper, auto is neural and grid a grid trained by the paper's losses."""
-    ablate: Ablation | None = None
+    ablate: Given[Ablation] = None
     """Leave one part of the method out, or change it, to see what it is worth."""
     device: Device = "auto"
     """Where the surface is fitted. cpu: compiled kernels; cuda: torch on a graphics card; torch-cpu: the code of cuda
@@ -63,9 +66,9 @@ class Calibrate:
 
     capture: CaptureFolder
     """Folder with board/, photos/ and optionally light/, dark/, side/; a flat folder of photos; or one with a clip."""
-    out: Path | None = None
+    out: Given[Path] = None
     """Folder for the results; runs/NAME unless given."""
-    board: str | None = None
+    board: Given[str] = None
     """The printed board: charuco:5x7:30:22:DICT_4X4_50 (squares columns x rows, square mm, marker mm, dictionary) or
     checkerboard:9x6:24.25 (inner corners, square mm); or a blank one: paper:A4, paper:letter, card. Otherwise
     session.toml says it, or common printed boards are tried."""
@@ -77,7 +80,7 @@ class Calibrate:
     """Start again in a folder that holds a run with other settings."""
     debug: Flag = False
     """Show the traceback of an error."""
-    for_research: OmitArgPrefixes[CalibrateResearch] = field(default_factory=CalibrateResearch)
+    research: OmitArgPrefixes[CalibrateResearch] = field(default_factory=CalibrateResearch)
     """Scenes of other programs, and comparisons."""
 
 
@@ -87,9 +90,9 @@ class Check:
 
     capture: CaptureFolder
     """Folder with board/, photos/ and optionally light/, dark/, side/; a flat folder of photos; or one with a clip."""
-    out: Path | None = None
+    out: Given[Path] = None
     """Folder for check.html and check.json; runs/NAME unless given."""
-    board: str | None = None
+    board: Given[str] = None
     """The printed board, as for `run`."""
     lights: str = "auto"
     """Where the lights come from, as for `run`."""
@@ -104,15 +107,15 @@ class Reconstruct(Calibrate):
     preset: Preset = "standard"
     """draft: a first look; standard: the default; fine: more pixels and a finer grid, several times as long; paper: the
     network, batch and 150 000 iterations of the ShadowNeuS paper, for a graphics card and a day."""
-    scale: str | None = None
+    scale: Given[str] = None
     """One known length of the object, such as "120 mm" (also cm, m, in), where no board gives the scale: its height
     above the ground or, without a ground, its largest extent across the picture. session.toml may say it, too."""
-    time_budget: float | None = None
+    time_budget: Given[float] = None
     """Shorten the schedule so that the run takes about this many seconds here, measured with a short loop."""
-    memory: float | None = None
+    memory: Given[float] = None
     """Gigabytes that the run may take; what this machine has free unless given. If that is too little, the run uses
     fewer photos or pixels and says so."""
-    for_research: OmitArgPrefixes[ReconstructResearch] = field(default_factory=ReconstructResearch)
+    research: OmitArgPrefixes[ReconstructResearch] = field(default_factory=ReconstructResearch)
     """Scenes of other programs, and comparisons."""
 
 
@@ -120,7 +123,7 @@ class Reconstruct(Calibrate):
 class Run(Reconstruct):
     """Photos to mesh: calibrate, reconstruct, report. The same command again continues where it stopped."""
 
-    viewer: Literal["on", "off", "keep"] | None = None
+    viewer: Given[Literal["on", "off", "keep"]] = None
     """on: a page that follows the run and ends with it; keep: it stays until Ctrl-C; off: none. Otherwise keep in a
     terminal, on elsewhere."""
 
@@ -135,7 +138,7 @@ class View:
     """Address to listen on. Anything but 127.0.0.1 lets others on the network see the page."""
     port: int = 8080
     """The next free one is taken where this one is busy."""
-    reference: Path | None = None
+    reference: Given[Path] = None
     """A mesh file or the folder of another run: the page can colour this run by its distance from it. A file without a
     unit is read in the unit of this run."""
     no_open: Flag = False
@@ -153,7 +156,7 @@ class Import:
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """The scene."""
-    out: Path | None = None
+    out: Given[Path] = None
     """A new folder for the result; imported/NAME unless given."""
     split: str = "train"
     """Which list of photos to read, where there are several: transforms_SPLIT.json, params_SPLIT.npz."""
@@ -179,7 +182,7 @@ class Report:
 
     run: ResultFolder
     """The folder of a run, finished or not."""
-    bundle: Path | None = None
+    bundle: Given[Path] = None
     """Pack log, reports, calibration, settings and versions into this .zip, without photos and personal paths."""
     with_pictures: Flag = False
     """Also pack small copies of the photos, and the pictures in the pages."""
@@ -197,7 +200,7 @@ class PrintBoard:
     """charuco is recognised from all sides and with parts of it hidden; a checkerboard has fewer fine details."""
     paper: Literal["a4", "letter"] = "a4"
     """The sheet."""
-    board: str | None = None
+    board: Given[str] = None
     """Another size, as charuco:5x7:30:22:DICT_4X4_50 or checkerboard:9x6:24."""
     debug: Flag = False
     """Show the traceback of an error."""
@@ -213,7 +216,7 @@ class Doctor:
 
 def settings_of(command: Calibrate) -> dict[str, Any]:
     """Return every option of a command by its name, those for research among the others."""
-    return {key: value for key, value in vars(command).items() if key != "for_research"} | vars(command.for_research)
+    return {key: value for key, value in vars(command).items() if key != "research"} | vars(command.research)
 
 
 def run_with(capture: Path, out: Path | None, **settings: Any) -> Run:
@@ -225,4 +228,4 @@ def run_with(capture: Path, out: Path | None, **settings: Any) -> Run:
     names = {one.name for one in fields(ReconstructResearch)}
     research = ReconstructResearch(**{key: value for key, value in settings.items() if key in names})
     others = {key: value for key, value in settings.items() if key not in names}
-    return Run(capture, out, viewer="off", for_research=research, **others)
+    return Run(capture, out, viewer="off", research=research, **others)

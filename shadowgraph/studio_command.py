@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 from rich.console import Console
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
+
+from shadowgraph.options import Flag
 
 WATCH_S = 0.5  # between two looks at a folder; nothing is read that has not changed
 HOME = "Shadowgraph"  # in the user's home, where no folder is named and the present one holds no captures
@@ -15,13 +17,13 @@ HOME = "Shadowgraph"  # in the user's home, where no folder is named and the pre
 class Studio:
     """Open the studio: photos in, models out, in the browser. `shadowgraph` alone does the same."""
 
-    folder: Annotated[Positional[Path | None], arg(metavar="FOLDER")] = None
+    folder: Annotated[Positional[Path | None], arg(metavar="FOLDER", help_behavior_hint="")] = None
     """Holds captures/ and runs/. Unless given: the present folder if it holds captures or runs, else ~/Shadowgraph."""
     port: int = 8090
     """The next free one is taken where this one is busy."""
-    no_open: FlagCreatePairsOff[bool] = False
+    no_open: Flag = False
     """Do not open the browser; print the address only."""
-    debug: FlagCreatePairsOff[bool] = False
+    debug: Flag = False
     """Show the traceback of an error."""
 
 
@@ -31,9 +33,9 @@ class Watch:
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """Where a tethered camera or a synced phone puts its photos."""
-    once: FlagCreatePairsOff[bool] = False
+    once: Flag = False
     """Say it of what is there, and end."""
-    debug: FlagCreatePairsOff[bool] = False
+    debug: Flag = False
     """Show the traceback of an error."""
 
 
@@ -45,11 +47,10 @@ def do_watch(command: Watch, console: Console) -> None:
     """
     import time
 
-    from capture.errors import CaptureError
+    from capture.files.names import refuse_no_folder
     from shadowgraph.terminal import print_lines
 
-    if not command.folder.is_dir():
-        raise CaptureError(f"{command.folder} is not a folder; the one that photos arrive in was needed.")
+    refuse_no_folder(command.folder, "the folder in which photos arrive")
     print_lines(console, f"Watching {command.folder}; Ctrl-C ends it.")
     from reconstruct.check.coach import Coach, seen_lines
 

@@ -28,6 +28,61 @@ def test_each_kind_of_options_belongs_to_one_subcommand():
     assert len({row.options for row in SUBCOMMANDS}) == len({row.name for row in SUBCOMMANDS}) == len(SUBCOMMANDS)
 
 
+@pytest.mark.parametrize("command", [row.name for row in SUBCOMMANDS])
+def test_no_help_speaks_of_none_or_of_what_is_not_switched_on(capsys, command):
+    with pytest.raises(SystemExit):
+        shadowgraph.main([command, "--help"])
+    text = capsys.readouterr().out
+    assert "None" not in text and "default: False" not in text
+
+
+@pytest.mark.parametrize(
+    ("typed", "there", "meant"),
+    [
+        ("sopt", "spot", "spot"),
+        ("in/Spto", "in/spot", "in/spot"),
+        ("museum/vsae/view_1", "museum/vase/view_1", "museum/vase/view_1"),
+        ("Xylophone", "spot", None),
+    ],
+)
+@pytest.mark.parametrize("command", ["run", "check", "view", "import", "watch", "export"])
+def test_a_folder_typed_wrong_is_answered_with_the_one_that_was_meant(
+    tmp_path, monkeypatch, capsys, command, typed, there, meant
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / there).mkdir(parents=True)
+    assert shadowgraph.main([command, typed]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"shadowgraph: {Path(typed)} is not a folder;") and said.count("\n") == 1
+    assert (f"did you mean {Path(meant)}?" in said) if meant else ("did you mean" not in said)
+    assert not (tmp_path / typed).exists()
+
+
+@pytest.mark.parametrize("command", ["view", "report", "export", "relight"])
+@pytest.mark.parametrize(
+    ("files", "asked", "answer"),
+    [
+        (["vase/photos/a.jpg"], "vase", "`shadowgraph run vase` makes one"),
+        (["vase/a.HEIC"], "vase", "`shadowgraph run vase` makes one"),
+        (["notes/todo.txt"], "notes", "`shadowgraph run CAPTURE` makes one"),
+        (["runs/vase/log.jsonl"], "runs", f"{Path('runs/vase')} is one"),
+        (["vase/photos/a.jpg", "runs/vase/log.jsonl"], "vase", f"{Path('runs/vase')} is one"),
+    ],
+)
+def test_a_folder_that_is_no_run_is_refused_in_one_line_that_says_what_to_do(
+    tmp_path, monkeypatch, capsys, command, files, asked, answer
+):
+    monkeypatch.chdir(tmp_path)
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    before = sorted(tmp_path.rglob("*"))
+    assert shadowgraph.main([command, asked]) == 2
+    said = capsys.readouterr().err
+    assert f"{asked} is not the folder of a run" in said and answer in said and said.count("\n") == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_run_takes_every_documented_option(capsys):
     with pytest.raises(SystemExit):
         shadowgraph.main(["run", "--help"])
@@ -47,7 +102,7 @@ def test_a_command_typed_wrong_is_answered_with_the_one_that_was_meant(capsys, t
 def test_help_of_run_shows_first_what_everybody_needs(capsys):
     with pytest.raises(SystemExit):
         shadowgraph.main(["run", "--help"])
-    first, _, rest = capsys.readouterr().out.partition("for-research options")
+    first, _, rest = capsys.readouterr().out.partition("research options")
     assert all(f"--{name} " in first for name in ("out", "board", "lights", "preset", "scale", "memory", "viewer"))
     assert all(f"--{name} " in rest for name in ("input", "split", "ablate", "field", "device", "seed", "ground"))
 

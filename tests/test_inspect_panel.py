@@ -99,6 +99,7 @@ def test_a_ray_that_no_browser_sends_reaches_no_tool(inspecting):
 
 
 def test_a_reference_that_is_not_there_is_refused_before_a_page_is_served(tmp_path):
+    (tmp_path / "log.jsonl").touch()
     with pytest.raises(ReconstructionError, match="--reference"):
         view(tmp_path, port=0, reference=tmp_path / "absent.ply")
 

@@ -12,6 +12,7 @@ from calibration.scenes.s3nerf import S3Nerf
 from calibration.scenes.shadowneus import ShadowNeus
 from calibration.scenes.shadowneus_real import ShadowNeusReal
 from capture.errors import CaptureError
+from capture.files.names import refuse_no_folder
 from capture.session.session import load_settings
 
 IMPORTERS: tuple[Importer, ...] = (
@@ -82,8 +83,7 @@ def import_folder(folder: Path, split: str, out: Path) -> tuple[Importer, KnownS
         CaptureError, CalibrationError: no known layout, a file or field that is missing or impossible, or a folder for
             the result that is not empty.
     """
-    if not folder.is_dir():
-        raise CaptureError(f"{folder} is not a folder; the folder of a scene was needed.")
+    refuse_no_folder(folder, "the folder of a scene")
     importer = find_importer(folder)
     if importer is None:
         layouts = ", ".join(one.layout for one in IMPORTERS)

@@ -5,7 +5,9 @@ frame of a clip has a path like a photo's: clip.mov at 12.34 s is clip#t=12.340s
 the clip and the time. The clip's suffix stays at the end, so that the stems of frames are unique, as those of photos.
 """
 
+import difflib
 import re
+from contextlib import suppress
 from pathlib import Path
 
 from capture.errors import CaptureError
@@ -39,6 +41,40 @@ def inside(folder: Path, name: str, said_by: str) -> Path:
             f"{said_by} names {shown}, which does not exist in {folder}; complete the folder, or correct the name."
         )
     return path
+
+
+def refuse_no_folder(path: Path, needed: str) -> None:
+    """Refuse a path that is no folder, and name a folder with a similar name if there is one.
+
+    Args:
+        needed: "the folder that holds the photos".
+
+    Raises:
+        CaptureError: it is none.
+    """
+    if path.is_dir():
+        return
+    if path.exists():
+        raise CaptureError(f"{path} is a file, not a folder; {needed} was needed.")
+    meant = similar_folder(path)
+    hint = f"did you mean {meant}?" if meant else f"{needed} was needed."
+    raise CaptureError(f"{path} is not a folder; {hint}")
+
+
+def similar_folder(path: Path) -> Path | None:
+    """Return the folder whose path is spelt most like a path that is none; None where no name is like it."""
+    here = Path(path.anchor)
+    for part in path.parts[1 if path.anchor else 0 :]:
+        if not (here / part).is_dir():
+            names: dict[str, str] = {}
+            with suppress(OSError):  # a folder that may not be listed
+                names = {each.name.casefold(): each.name for each in here.iterdir() if each.is_dir()}
+            near = difflib.get_close_matches(part.casefold(), names, 1)
+            if not near:
+                return None
+            part = names[near[0]]
+        here /= part
+    return here
 
 
 def natural_order(path: Path) -> list[tuple[int, str]]:

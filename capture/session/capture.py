@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from capture.errors import CaptureError
-from capture.files.names import natural_order
+from capture.files.names import natural_order, refuse_no_folder
 from capture.session.places import by_place
 from capture.session.roles import find_tripods
 from capture.session.session import (
@@ -61,8 +61,7 @@ def load_capture(folder: Path) -> Capture:
     Raises:
         CaptureError: there is no such folder, no view can be read, or an error in session.toml.
     """
-    if not folder.is_dir():
-        raise CaptureError(f"{folder} is not a folder. Give the folder that holds the photos.")
+    refuse_no_folder(folder, "the folder that holds the photos")
     views, lies = folders_named(folder, VIEWS), folders_named(folder, LIES)
     if not views and not lies:
         session = load_session(folder)

@@ -10,7 +10,7 @@ from typing import Any
 
 from capture.decode.formats import format_of, is_photo_name
 from capture.errors import CaptureError
-from capture.files.names import clip_of, is_clip_name, natural_order, stored_file
+from capture.files.names import clip_of, is_clip_name, natural_order, refuse_no_folder, stored_file
 from capture.files.regular import why
 from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
 from capture.session.declared_objects import (
@@ -100,8 +100,7 @@ def load_session(folder: Path, common: SessionSettings | None = None) -> Session
         CaptureError: there is no such folder, photos or board, too few lit photos, a file that is no photo, or an error
             in session.toml.
     """
-    if not folder.is_dir():
-        raise CaptureError(f"{folder} is not a folder. Give the folder that holds the photos.")
+    refuse_no_folder(folder, "the folder that holds the photos")
     settings = load_settings(folder)
     if common is not None:
         settings = settings if (folder / SETTINGS_FILE).exists() else replace(common, roles=())

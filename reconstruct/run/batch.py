@@ -23,7 +23,7 @@ from capture.decode.formats import is_photo_name
 from capture.errors import CaptureError, UserError
 from capture.files.atomic import read_json, write_json
 from capture.files.json_field import JsonField
-from capture.files.names import is_clip_name
+from capture.files.names import is_clip_name, refuse_no_folder
 from capture.session.session import ROLE_FOLDERS
 from reconstruct.run_folder.lock import LOCK, lock_holder
 from reconstruct.stored_run.documents import MOST_PHOTOS, checked_report
@@ -79,8 +79,7 @@ def find_captures(folders: Sequence[Path], out: Path) -> list[Path]:
     """
     found: list[Path] = []
     for folder in folders:
-        if not folder.is_dir():
-            raise CaptureError(f"{folder} is not a folder; captures, or folders of captures, were needed.")
+        refuse_no_folder(folder, "a capture, or a folder of captures,")
         places = (path for path in folder.iterdir() if path.is_dir() and path.resolve() != out.resolve())
         inner = sorted(path for path in places if not path.name.startswith("."))
         is_collection = not looks_like_capture(folder) and any(looks_like_capture(path) for path in inner)

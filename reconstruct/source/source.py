@@ -13,7 +13,7 @@ from calibration.scenes.ground_depth import find_ground_depth
 from calibration.scenes.importers import find_importer
 from calibration.scenes.listed_lights import load_listed
 from capture.errors import CaptureError, UserError
-from capture.files.names import clip_of
+from capture.files.names import clip_of, refuse_no_folder
 from capture.photos.photo import read_photo
 from capture.session.capture import Capture, load_capture
 from capture.session.roles import NoBoardError
@@ -113,8 +113,7 @@ def open_source(folder: Path, options: RunOptions) -> Source:
     Raises:
         CaptureError, CalibrationError: the folder does not exist, or holds no input for a run.
     """
-    if not folder.is_dir():
-        raise CaptureError(f"{folder} is not a folder; a folder with photos was needed.")
+    refuse_no_folder(folder, "the folder that holds the photos")
     given = None if options.lights in WAYS else Path(options.lights)
     if given is not None and not given.is_file():
         raise CaptureError(f"--lights {given} is no such file; {', '.join(WAYS)}, or a file of lights was needed.")

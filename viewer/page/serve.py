@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from capture.errors import UserError
 from reconstruct.run.bundle import user_name
 from reconstruct.run_folder.cost import give_memory_back, share_memory_among_threads
+from reconstruct.stored_run.refusal import refuse_no_run
 from viewer.page.guard import GuardedServer, is_loopback
 from viewer.page.visitors import Visitors
 from viewer.stage.files import StageFiles
@@ -30,7 +30,7 @@ def view(
     """Serve the page of a run folder until Ctrl-C, or, with `once`, until the run is over.
 
     Args:
-        run_dir: a run's folder; it may still be empty.
+        run_dir: a run's folder; the run may have just begun.
         host: 127.0.0.1 unless others shall see and use the page; they need the token of the printed address.
         port: if it is busy, the next free one is taken.
         say: called with each line about the address, once it is known.
@@ -38,10 +38,9 @@ def view(
         opens: called with the address, to show it in a browser.
 
     Raises:
-        UserError: there is no such folder, or the reference cannot be read.
+        UserError: it is not the folder of a run, or the reference cannot be read.
     """
-    if not Path(run_dir).is_dir():
-        raise UserError(f"{run_dir} is not a folder; the folder of a run was needed (the --out of `shadowgraph run`).")
+    refuse_no_run(Path(run_dir))
     compared_with = None
     if reference is not None:
         from reconstruct.evaluate.deviation import load_reference

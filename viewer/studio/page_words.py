@@ -56,7 +56,7 @@ _RULES = (
     (r"; --memory GB overrides this", ""),
     (r"Export again with another number of --faces", "Save it in another format"),
     (r" \(--format\)", ""),
-    (r" \(the --out of `shadowgraph run`\)", ""),
+    (r"\. `shadowgraph run [^`]*` makes one", ""),
     # of two ways out, the one that the page has, too
     (r", or [^,.;]*--[a-z][^,.;]*", ""),
     (r"(?<=[.!?:] )[^.,;!?:]*--[a-z][^,.;!?]*, or (\w)", lambda found: found.group(1).upper()),
