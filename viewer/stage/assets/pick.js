@@ -67,4 +67,3 @@ export function pointingSigma(place, normal, width, height) {
   const facing = clamp(Math.abs(dot(normal, unit(add(toPage(place), camera.eye, -1)))), 0.1, 1);
   return 0.5 * away / (view.focal * Math.min(width, height)) / facing;
 }
-
