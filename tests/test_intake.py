@@ -3,6 +3,8 @@
 import asyncio
 import io
 import stat
+import struct
+import threading
 import zipfile
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -10,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from waiting import PATIENCE_S
 
 from capture.errors import CaptureError
 from capture.intake import archive, arrivals
@@ -54,6 +57,8 @@ def send(parts: Parts, name: str, content: bytes, role: str = ""):
         ("con.jpg", "_con.jpg"),
         ("a\0b\n.png", "a_b_.png"),
         ("x" * 300 + ".jpg", "x" * 80 + ".jpg"),
+        ("写" * 300 + ".jpg", "写" * 26 + ".jpg"),
+        ("𠀀" * 300 + ".𠀀jpg", "𠀀" * 20 + ".𠀀jpg"),
     ],
 )
 def test_names_of_strangers_become_names_that_every_system_takes(given, safe):
@@ -217,11 +222,125 @@ def test_a_zip_is_unpacked_without_what_leads_elsewhere_and_says_what_was_left_o
     assert sorted(p.name for p in studio.rglob("*.jpg")) == ["a.jpg", "b.jpg", "c.jpg"]
 
 
-def test_a_zip_that_lies_about_its_sizes_or_is_none_is_refused(studio, monkeypatch):
-    monkeypatch.setattr(arrivals, "LARGEST_PHOTO", 10_000)
-    bomb = send(Parts(studio / "parts", studio), "v.zip", zipped({"a.jpg": b"\xff\xd8\xff" + bytes(10_000_000)}))
-    assert "holds no photos" in bomb.refused and not list((studio / "vase").iterdir())
-    assert "damaged" in send(Parts(studio / "parts", studio), "w.zip", b"PK nothing").refused
+def packed(method: int) -> bytes:
+    """A zip of three photos, the second of which is damaged in the middle by whoever calls this."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", method) as made:
+        for k in range(3):
+            made.writestr(f"{k}.jpg", jpeg(k))
+    return file.getvalue()
+
+
+def with_bytes(content: bytes, at: int, new: bytes) -> bytes:
+    return content[:at] + new + content[at + len(new) :]
+
+
+def in_second(content: bytes, offset: int, new: bytes) -> bytes:
+    """Change bytes of the second entry's header or content."""
+    with zipfile.ZipFile(io.BytesIO(content)) as opened:
+        return with_bytes(content, opened.infolist()[1].header_offset + offset, new)
+
+
+def in_directory(content: bytes, offset: int, new: bytes) -> bytes:
+    """Change bytes of what the archive's directory says of its second entry."""
+    at = content.index(b"PK\1\2", content.index(b"PK\1\2") + 4)
+    return with_bytes(content, at + offset, new)
+
+
+DAMAGED_IN_ONE = {
+    "deflate": in_second(packed(zipfile.ZIP_DEFLATED), 60, bytes(200)),
+    "bzip2": in_second(packed(zipfile.ZIP_BZIP2), 60, bytes(200)),
+    "lzma": in_second(packed(zipfile.ZIP_LZMA), 60, b"\xff" * 200),
+    "the settings of lzma": in_second(packed(zipfile.ZIP_LZMA), 37, b"\xff" * 9),
+    "a wrong sum": in_directory(packed(zipfile.ZIP_STORED), 16, b"1234"),
+    "encrypted": in_directory(packed(zipfile.ZIP_DEFLATED), 8, b"\1"),
+    "a method that nobody knows": in_directory(packed(zipfile.ZIP_DEFLATED), 10, b"\x5d"),
+    "another name in its header": in_second(packed(zipfile.ZIP_STORED), 30, b"x"),
+    "no header": in_second(packed(zipfile.ZIP_STORED), 0, b"none"),
+    "a size that is none": in_directory(packed(zipfile.ZIP_DEFLATED), 24, b"\x10\0\0\0"),
+}
+DAMAGED_AS_A_WHOLE = {
+    "cut short": packed(zipfile.ZIP_DEFLATED)[:3000],
+    "without its end": packed(zipfile.ZIP_DEFLATED)[:-22],
+    "only its beginning": b"PK nothing",
+    "a directory elsewhere": with_bytes(packed(zipfile.ZIP_STORED), len(packed(0)) - 6, b"\xff\xff\xff\x7f"),
+}
+
+
+@pytest.mark.parametrize("content", DAMAGED_IN_ONE.values(), ids=list(DAMAGED_IN_ONE))
+def test_a_photo_of_a_zip_that_cannot_be_unpacked_is_named_and_the_others_arrive(studio, content):
+    done = send(Parts(studio / "parts", studio), "v.zip", content)
+    assert done.arrived == ("0.jpg", "2.jpg") and len(done.remarks) == 1 and done.remarks[0].startswith("1.jpg: it ")
+
+
+@pytest.mark.parametrize("content", DAMAGED_AS_A_WHOLE.values(), ids=list(DAMAGED_AS_A_WHOLE))
+def test_a_damaged_zip_is_set_aside_with_a_sentence(studio, content):
+    parts = Parts(studio / "parts", studio)
+    assert "Pack it again" in send(parts, "v.zip", content).refused and not parts.unfinished()
+
+
+@pytest.mark.parametrize(
+    "fault", [LookupError("x"), OSError("Invalid data stream"), AssertionError(), struct.error("x"), MemoryError()]
+)
+def test_whatever_a_file_leads_to_it_is_set_aside_and_can_be_dismissed(studio, monkeypatch, fault):
+    def fail(*_: object) -> None:
+        raise fault
+
+    monkeypatch.setattr("capture.intake.parts.settle", fail)
+    parts = Parts(studio / "parts", studio)
+    part = send(parts, "a.jpg", jpeg())
+    assert type(fault).__name__ in part.refused and not parts.unfinished()
+    ((told, sentence),) = parts.complaints("vase")
+    assert told.id == part.id and sentence.startswith("it cannot be taken")
+    parts.drop(part)
+    assert not parts.complaints("vase") and not Parts(studio / "parts", studio).complaints("vase")
+
+
+def overlapping(first: bytes, count: int) -> bytes:
+    """A zip whose directory names one content many times."""
+    content = zipped({"0.jpg": first})
+    at, end = content.index(b"PK\1\2"), content.index(b"PK\5\6")
+    counts = struct.pack("<HHI", count, count, (end - at) * count)
+    return content[:at] + content[at:end] * count + with_bytes(content[end:], 8, counts)
+
+
+@pytest.mark.parametrize("first", [jpeg(), b"\xff\xd8\xff" + bytes(3_000_000), b""], ids=["photo", "zeros", "nothing"])
+def test_a_zip_whose_files_share_bytes_is_refused_as_a_whole(studio, first):
+    refused = send(Parts(studio / "parts", studio), "v.zip", overlapping(first, 50)).refused
+    assert "overlap" in refused and not list((studio / "vase").iterdir())
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_what_grows_as_no_photo_does_is_not_unpacked(studio, method):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", method) as made:
+        for k in range(4):
+            made.writestr(f"{k}.jpg", b"\xff\xd8\xff" + bytes(5_000_000))
+        made.writestr("photo.jpg", jpeg())
+    done = send(Parts(studio / "parts", studio), "v.zip", file.getvalue())
+    assert done.arrived == ("photo.jpg",) and len(done.remarks) == 4 and "times" in done.remarks[0]
+
+
+def test_a_photo_arrives_while_an_archive_is_being_unpacked(studio, monkeypatch):
+    parts = Parts(studio / "parts", studio)
+    sent = []
+
+    def other_arrives(_entry: zipfile.ZipInfo, _room: int, _capture: Path) -> None:
+        name = f"other{len(sent)}.jpg"
+        sent.append(threading.Thread(target=send, args=(parts, name, jpeg(9 + len(sent)))))
+        sent[-1].start()
+        sent[-1].join(PATIENCE_S)
+        assert (studio / "vase" / name).is_file()
+
+    monkeypatch.setattr(archive, "_refuse", other_arrives)
+    assert send(parts, "v.zip", packed(zipfile.ZIP_DEFLATED)).arrived == ("0.jpg", "1.jpg", "2.jpg")
+    assert len(sent) == 3
+
+
+def test_an_archive_is_held_to_the_number_and_the_bytes_of_its_files(studio, monkeypatch):
+    monkeypatch.setattr(archive, "LARGEST_TOTAL", int(2.5 * len(jpeg())))
+    done = send(Parts(studio / "parts", studio), "v.zip", packed(zipfile.ZIP_STORED))
+    assert len(done.arrived) == 2 and "MB are taken" in done.remarks[0]
     monkeypatch.setattr(archive, "MOST_ENTRIES", 3)
     many = zipped({f"{k}.jpg": jpeg(k) for k in range(4)})
     assert "at most 3" in send(Parts(studio / "parts", studio), "m.zip", many).refused

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from studio_client import Client, Process, served
+from waiting import wait_until
 
 MOST_TRIES = 50
 PIECE = 1 << 20
@@ -107,3 +108,46 @@ def test_forty_photos_of_twelve_megapixels_survive_ten_drops_and_two_kills(tmp_p
     files = photos(40, 4_200_000)
     assert send_all(tmp_path, files, drops=10, kills=2) == (10, 2)
     check(tmp_path, files)
+
+
+@pytest.mark.parametrize("fault", [KeyError("x"), RuntimeError("x"), EOFError(), MemoryError()])
+def test_a_studio_whose_work_on_one_file_fails_goes_on_and_opens_again(tmp_path, monkeypatch, fault):
+    def fail(*_: object) -> None:
+        raise fault
+
+    ((name, content),) = photos(1, 3000).items()
+    with served(tmp_path) as (studio, _, owner):
+        key = owner.ok("new", title="vase")
+        waiting = studio.parts.begin(key, "waiting.jpg", 4)
+        (studio.parts.folder / f"{waiting.id}.part").write_bytes(content[:4])  # whole, and the studio was killed
+        monkeypatch.setattr(studio.checks, "tick", fail)
+        monkeypatch.setattr(studio.queue, "tick", fail)
+    monkeypatch.setattr("capture.intake.parts.settle", fail)
+    with served(tmp_path) as (studio, _, owner):
+        monkeypatch.setattr(studio.checks, "tick", fail)
+        wait_until(lambda: owner.get(f"/api/capture?key={key}")[1]["refused"])
+        monkeypatch.undo()
+        assert owner.send(key, name, content).status == 204
+        row = owner.get(f"/api/capture?key={key}")[1]
+        assert [photo["name"] for photo in row["photos"]] == [name] and row["coming"] == 0
+        ((refused),) = row["refused"]
+        assert refused["name"] == "waiting.jpg" and type(fault).__name__ in refused["why"]
+        owner.ok("dismiss", key=key, part=refused["id"])
+        assert not owner.get(f"/api/capture?key={key}")[1]["refused"]
+        assert owner.post("dismiss", key=key, part=refused["id"])[0] == 400
+        assert all(thread.is_alive() for thread in studio._threads)
+
+
+def test_a_file_that_waits_for_room_says_so_and_can_be_dismissed(tmp_path, monkeypatch):
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("capture.intake.parts.settle", full)
+    with served(tmp_path) as (_, _, owner):
+        key = owner.ok("new", title="vase")
+        assert owner.send(key, "a.jpg", b"\xff\xd8\xff\xe0").status == 507
+        row = owner.get(f"/api/capture?key={key}")[1]
+        assert row["coming"] == 1 and "No space left" in row["refused"][0]["why"]
+        owner.ok("dismiss", key=key, part=row["refused"][0]["id"])
+        row = owner.get(f"/api/capture?key={key}")[1]
+        assert row["coming"] == 0 and not row["refused"]

@@ -18,7 +18,7 @@ LARGEST_CLIP = 8 << 30  # bytes: ten minutes of 4K have 4 GB
 LARGEST_DESCRIPTION = 16 << 20  # bytes
 MOST_FILES = 2_000  # of a capture
 KEEP_FREE = 1 << 30  # bytes of the disk that no arrival may take: runs need some, too
-LONGEST_STEM = 80  # letters
+LONGEST_STEM = 80  # bytes: systems take 255 in a name, and a letter may have four
 DESCRIPTIONS = {"session.toml", "lights.json", MASK}  # beside photos, by their names
 LIGHT_LISTS = {".lp", ".csv", ".dome"}
 FOLDERS = frozenset(ROLE_FOLDERS.values())
@@ -33,7 +33,8 @@ def safe_name(name: str) -> str:
     """
     last = re.split(r"[/\\]", name)[-1]
     path = PurePosixPath(re.sub(r"[^\w.+()@=~ -]", "_", last).strip(" .") or "_")
-    stem, suffix = path.stem[:LONGEST_STEM].rstrip(" ."), path.suffix[:10]
+    stem = path.stem.encode()[:LONGEST_STEM].decode(errors="ignore").rstrip(" .")
+    suffix = path.suffix[:10]
     if not stem.strip("_ "):
         raise CaptureError(f"{name[:80]!r} is no name of a file; one such as IMG_0001.jpg was needed.")
     return f"_{stem}{suffix}" if _RESERVED.fullmatch(stem) else f"{stem}{suffix}"

@@ -18,6 +18,7 @@ from capture.decode.formats import is_photo_name
 from capture.errors import CaptureError, UserError
 from capture.files.atomic import read_json, write_json
 from capture.files.json_field import JsonField
+from capture.files.regular import why
 from capture.intake.archive import unpack
 from capture.intake.arrivals import (
     MOST_FILES,
@@ -77,7 +78,8 @@ class Parts:
         folder.mkdir(parents=True, exist_ok=True)
         self._known: dict[str, Part] = {}
         self._newest: dict[str, int] = {}  # how many pieces of a file were begun
-        self._one_at_a_time = threading.Lock()
+        self._settling = threading.Lock()  # while a file moves to its place: names are given one by one
+        self._finishing: dict[str, threading.Lock] = {}  # by id: an archive takes minutes, and holds up no other file
         for path in folder.glob("*.json"):
             part = _read(path)
             is_gone = part is not None and not part.is_over and not self._path(part.id).exists()  # into its capture
@@ -86,7 +88,7 @@ class Parts:
                 path.with_suffix(".part").unlink(missing_ok=True)
             else:
                 self._known[part.id] = part
-        self._put_off = {part.id for part in self.unfinished()}
+        self._put_off = dict.fromkeys((part.id for part in self.unfinished()), "")  # and why, where that is known
 
     def begin(self, capture: str, name: str, size: int, role: str = "", sender: str = "") -> Part:
         """Note a file that will come, and return it with its id.
@@ -128,9 +130,14 @@ class Parts:
         then = time.time() - STALLED_S
         return [p for p in self.under_way(capture) if self.offset(p) < p.size and self._touched(p) < then]
 
-    def of(self, capture: str) -> list[Part]:
-        """Return every file that was sent to a capture and is remembered."""
-        return [part for part in list(self._known.values()) if part.capture == capture]
+    def complaints(self, capture: str) -> list[tuple[Part, str]]:
+        """Return what was not taken of the files sent to a capture, and what waits, each with a sentence."""
+        found = []
+        for part in list(self._known.values()):
+            waits = self._put_off.get(part.id)
+            said = [part.refused] if part.refused else [f"it waits: {waits}."] if waits else part.remarks
+            found += [(part, sentence) for sentence in said if part.capture == capture]
+        return found
 
     def offset(self, part: Part) -> int:
         """Return how many bytes of it are here."""
@@ -168,41 +175,51 @@ class Parts:
     def finish(self, part: Part) -> Part:
         """Put a file that is whole into its capture; archives are unpacked. What is wrong with it is its `refused`.
 
+        This is where work on strangers' files is done: whatever one of them leads to, it is set aside with a sentence.
+
         Raises:
             OSError: the capture cannot be written to, or the disk is full: the file waits, and may be finished later.
         """
-        with self._one_at_a_time:
+        with self._finishing.setdefault(part.id, threading.Lock()):
             known = self._known.get(part.id, part)
             if known.is_over:
                 return known
-            self._put_off.add(part.id)
-            done = self._finish(known)
-            self._put_off.discard(part.id)
+            try:
+                done = self._put(known)
+            except UserError as error:
+                done = replace(known, refused=str(error))
+            except Exception as error:
+                if isinstance(error, OSError) and error.errno is not None:  # the system's own, not a decoder's
+                    self._put_off[part.id] = why(error)
+                    raise
+                done = replace(known, refused=f"it cannot be taken ({type(error).__name__}: {why(error)}).")
+            self._put_off.pop(part.id, None)
+            self._known[part.id] = done  # also where that cannot be noted: it is in its capture
+            self._note(done)
+            self._path(part.id).unlink(missing_ok=True)
             return done
 
-    def _finish(self, part: Part) -> Part:
+    def _put(self, part: Part) -> Part:
         capture = self.root / part.capture
-        try:
-            if not capture.is_dir():
-                raise CaptureError("its capture was deleted meanwhile.")
-            if Path(part.name).suffix.lower() == ARCHIVE:
-                unpacked = unpack(self._path(part.id), capture, part.role)
-                done = replace(part, arrived=unpacked.arrived, remarks=unpacked.remarks)
-                if not unpacked.arrived:
-                    raise CaptureError(f"{part.name} holds no photos. {' '.join(unpacked.remarks[:3])}")
-            else:
-                if sum(1 for path in capture.rglob("*")) >= MOST_FILES:
+        if not capture.is_dir():
+            raise CaptureError("its capture was deleted meanwhile.")
+
+        def settled(file: Path, name: str) -> Path:
+            with self._settling:
+                if sum(1 for _ in capture.rglob("*")) >= MOST_FILES:
                     raise CaptureError(f"the capture holds {MOST_FILES} files already, no more are taken.")
-                place = settle(self._path(part.id), place_in(capture, part.name, part.role))
+                place = settle(file, place_in(capture, name, part.role))
                 if part.role and part.role != "lit" and place.parent == capture and is_photo_name(place):
                     set_role(capture, place.name, part.role)
-                done = replace(part, arrived=(str(place.relative_to(capture)),))
-        except UserError as error:
-            done = replace(part, refused=str(error))
-        self._known[part.id] = done  # also where that cannot be noted: it is in its capture
-        self._note(done)
-        self._path(part.id).unlink(missing_ok=True)
-        return done
+                return place
+
+        if Path(part.name).suffix.lower() != ARCHIVE:
+            place = settled(self._path(part.id), part.name)
+            return replace(part, arrived=(str(place.relative_to(capture)),))
+        unpacked = unpack(self._path(part.id), capture, settled)
+        if not unpacked.arrived:
+            raise CaptureError(f"it holds no photos. {' '.join(unpacked.remarks[:3])}")
+        return replace(part, arrived=unpacked.arrived, remarks=unpacked.remarks)
 
     def unfinished(self) -> list[Part]:
         """Return files that are whole but not in their captures: the server was killed between, or had no room."""
@@ -212,12 +229,13 @@ class Parts:
         """Put files into their captures that could not be put there before, as far as that works now."""
         for part in self.unfinished():
             if part.id in self._put_off:
-                with suppress(OSError):
+                with suppress(OSError):  # there is still no room: its sentence says so
                     self.finish(part)
 
     def drop(self, part: Part) -> None:
         """Forget a file; what came of it is removed, unless it has arrived."""
         self._known.pop(part.id, None)
+        self._put_off.pop(part.id, None)
         self._path(part.id).unlink(missing_ok=True)
         self._path(part.id).with_suffix(".json").unlink(missing_ok=True)
 

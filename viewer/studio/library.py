@@ -70,9 +70,8 @@ class Library:
             look = looks.get(name, {})
             row = {"name": name, "role": look.get("role", ""), "remarks": look.get("remarks", [])}
             photos.append({**row, "drop": look.get("drop", False), "looked": name in looks})
-        sent = self._parts.of(key)
-        refused = [{"name": part.name, "why": part.refused} for part in sent if part.refused]
-        refused += [{"name": part.name, "why": remark} for part in sent for remark in part.remarks]
+        complaints = self._parts.complaints(key)
+        refused = [{"id": part.id, "name": part.name, "why": sentence} for part, sentence in complaints]
         return card | {
             "photos": photos,
             "clips": [clip.relative_to(path).as_posix() for clip in clips_of(path)],

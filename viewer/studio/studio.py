@@ -2,8 +2,10 @@
 
 import contextlib
 import threading
+import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
@@ -30,6 +32,7 @@ from viewer.studio.saving import Saving
 from viewer.studio.trash import Trash
 
 TICK_S = 0.5
+LEAVING_S = 5.0  # that a step may take to its end when the studio closes; files that are cut off go on the next time
 LONGEST_TITLE = 120  # letters
 PICTURE_PX, RUN_PICTURE_PX = 320, 640
 USUAL = (36, 4032, 3024)  # photos, and their px, where none are there yet: a phone's
@@ -59,18 +62,21 @@ class Studio:
         self.pages = LivePages(folder)
         self.growing = Growing(folder, self.thumbnails)
         self.saving = Saving(folder)
+        self._lock, self._ended = threading.RLock(), threading.Event()
         self._measured: dict[tuple[int, int, int], Future[Any]] = {}  # for so many photos, of this size
         self._costs: dict[str, dict[str, Any]] = {}  # of jobs, as predicted when they were first shown
         self._stages: dict[Path, StageFiles] = {}
         self._stage_lock = threading.Lock()
         self._prepared = {job.id for job in self.queue.jobs if job.state == FINISHED}
-        self._lock = threading.RLock()
-        self._ended = threading.Event()
-        self._threads = [threading.Thread(target=self._keep_going, name="studio", daemon=True)]
+        self._faults: dict[str, str] = {}  # the newest of each step
+        arriving = (contextlib.nullcontext(), self.parts.try_again)  # an archive takes minutes and holds nothing up
+        working = (self._lock, self.queue.tick, self.checks.tick, self._prepare_results)
+        self._threads = [
+            threading.Thread(target=self._keep_going, args=steps, daemon=True) for steps in (arriving, working)
+        ]
 
     def start(self) -> None:
         """Put files into their captures that were whole when the studio was killed; run the queue."""
-        self.parts.try_again()
         self.saving.clear()
         for thread in self._threads:
             thread.start()
@@ -79,7 +85,7 @@ class Studio:
         """End the helpers and a check; runs go on."""
         self._ended.set()
         for thread in self._threads:
-            thread.join()
+            thread.join(LEAVING_S)
         self.checks.close()
         self.pages.close()
         self.looks.close()
@@ -242,6 +248,12 @@ class Studio:
         for part in self.parts.stalled(self.folder.key(self.folder.capture(key))):
             self.parts.drop(part)
 
+    def dismiss(self, key: str, part: str) -> None:
+        """Forget a file that was sent to a capture and not taken, or waits for room; what of it has arrived stays."""
+        if all(one.id != part for one, _ in self.parts.complaints(key)):
+            raise CaptureError("This file is not in the list any more.")
+        self.parts.drop(self.parts.find(part))
+
     def delete_photo(self, key: str, photo: str) -> None:
         """Move one photo or clip of a capture into the trash."""
         capture = self.folder.capture(key)
@@ -304,16 +316,23 @@ class Studio:
     def _refuse(self, task: Task) -> None:
         refuse_full_disk(0, Path(task.out) if Path(task.out).is_dir() else self.folder.root)
 
-    def _keep_going(self) -> None:
+    def _keep_going(self, lock: AbstractContextManager[Any], *steps: Callable[[], None]) -> None:
+        """Take steps again and again under a lock. What one raises, whichever file it is about, ends nothing else."""
         while not self._ended.wait(TICK_S):
-            self.parts.try_again()
-            with self._lock:
+            for step in steps:
                 try:
-                    self.queue.tick()
-                    self.checks.tick()
-                    self._prepare_results()
-                except (OSError, UserError):
-                    continue  # a full disk: the next tick tries again
+                    with lock:
+                        step()
+                except Exception as error:  # noqa: BLE001  strangers' files: the next tick tries again
+                    self._note_fault(step.__name__, error)
+
+    def _note_fault(self, step: str, error: Exception) -> None:
+        """Keep the newest fault of a step in a file, for a bug report."""
+        text = "".join(traceback.format_exception(error))
+        if self._faults.get(step) != text:
+            self._faults[step] = text
+            with contextlib.suppress(OSError):  # the disk may be full
+                (self.folder.kept / f"fault_{step.strip('_')}.txt").write_text(text, "utf-8", "replace")
 
 
 def _title(text: str) -> str:

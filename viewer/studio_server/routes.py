@@ -98,6 +98,7 @@ def _changes(studio: Studio, phones: Phones) -> list[Route]:
         change("rename", studio.rename, "key", "title"),
         change("delete", studio.delete, "key"),
         change("go_on_without", studio.go_on_without, "key"),
+        change("dismiss", studio.dismiss, "key", "part"),
         change("delete_photo", studio.delete_photo, "key", "photo"),
         change("restore", studio.trash.restore, "id"),
         change("empty_trash", studio.empty_trash),
