@@ -74,6 +74,22 @@ def test_the_first_screen_of_the_readme_shows_the_two_commands():
     assert any("pip install '.[test]'" in c and "pytest" in c for c in commands)
 
 
+def test_each_command_of_the_readme_works_alone_in_a_fresh_clone():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"(?:^    .*\n)+", readme, re.MULTILINE)
+    assert "git clone" in blocks[0] and "cd shadowgraph" in blocks[0]
+    commands = [line.strip() for block in blocks[1:] for line in block.splitlines() if ".venv" in line]
+    assert len(commands) == 3
+    assert all(
+        re.match(r"python3 -m venv \.venv && \.venv/bin/pip install \S+ && \.venv/bin/", one) for one in commands
+    )
+
+
+def test_the_readme_is_short_and_says_windows_paths_once():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(readme.split()) <= 700 and readme.count("Scripts") == 1
+
+
 @pytest.mark.parametrize(
     ("name", "views", "lies"), [("spot", [""], []), ("cow", ["view_1", "view_2", "view_3"], ["turned_1"])]
 )
