@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from calibration.calibrated_views import load_views
 from calibration.calibration import Calibration
 from capture.errors import ReconstructionError
+from capture.files.title import title_of
 from reconstruct.fields import Fields
 from reconstruct.stored_run.documents import lit_photos
 from reconstruct.stored_run.stored_run import StoredRun
@@ -111,6 +112,6 @@ class RunResult:
         return (
             '<div style="display:flex;gap:1.5em;align-items:center;flex-wrap:wrap">'
             f'<img alt="The mesh from the camera\'s side" width="{CARD_PX[0] // 2}" src="{data_uri(picture)}">'
-            f"<div><b>{html.escape(self.path.resolve().name)}</b>{lines}"
+            f"<div><b>{html.escape(title_of(self.path))}</b>{lines}"
             f"<code>shadowgraph view {html.escape(str(self.path))}</code></div></div>"
         )

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from capture.errors import CaptureError
 
+DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)", re.IGNORECASE)  # names that Windows keeps for devices
 CLIP_SUFFIXES = {".mp4", ".mov", ".m4v", ".3gp", ".mkv", ".webm", ".avi"}
 _NAME = re.compile(r"(?P<stem>.+)#t=(?P<seconds>\d+\.\d{3})s")
 

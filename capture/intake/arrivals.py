@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from capture.decode.formats import format_of, is_photo_name
 from capture.errors import CaptureError
 from capture.files.atomic import flush_folder
-from capture.files.names import is_clip_name
+from capture.files.names import DEVICES, is_clip_name
 from capture.session.session import MASK, PHONE_BACK, ROLE_FOLDERS
 
 LARGEST_PHOTO = 400 << 20  # bytes: a RAW file of 100 megapixels has 200 MB
@@ -22,7 +22,6 @@ LONGEST_STEM = 80  # bytes: systems take 255 in a name, and a letter may have fo
 DESCRIPTIONS = {"session.toml", "lights.json", MASK}  # beside photos, by their names
 LIGHT_LISTS = {".lp", ".csv", ".dome"}
 FOLDERS = frozenset(ROLE_FOLDERS.values())
-_RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)", re.IGNORECASE)  # names that Windows keeps for devices
 
 
 def safe_name(name: str) -> str:
@@ -37,7 +36,7 @@ def safe_name(name: str) -> str:
     suffix = path.suffix[:10]
     if not stem.strip("_ "):
         raise CaptureError(f"{name[:80]!r} is no name of a file; one such as IMG_0001.jpg was needed.")
-    return f"_{stem}{suffix}" if _RESERVED.fullmatch(stem) else f"{stem}{suffix}"
+    return f"_{stem}{suffix}" if DEVICES.fullmatch(stem) else f"{stem}{suffix}"
 
 
 def largest_size(name: str) -> int:

@@ -15,6 +15,7 @@ from calibration.calibration import Calibration
 from calibration.light import Light
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError, CaptureError
+from capture.files.title import title_of
 from capture.photos.photo import PhotoStack
 from capture.session.session import FEWEST_LIT
 from reconstruct.check.judge_views import judge_together
@@ -91,7 +92,7 @@ def _check_without_ground(source: Source, photos: Photos | CaptureError, calibra
     scene = replace(build_scene(photos.stack, calibration, LONG_SIDE, mask=photos.mask), ground_known=False)
     readiness, cover = judge_without_ground(scene, calibration, photos.findings)
     notes = tuple(map(str, calibration.residuals.get("notes", [])))
-    name = source.folder.resolve().name
+    name = title_of(source.folder)
     return CaptureCheck(name, readiness, calibration, photos.findings, cover, notes)
 
 
@@ -123,7 +124,7 @@ def check_capture(
     if len(named) == 1:
         return found[0]
     readiness = judge_together(views, [one.readiness for one in found], [one.cover for one in found])
-    return replace(found[0], name=source.folder.resolve().name, readiness=readiness, further=tuple(found[1:]))
+    return replace(found[0], name=title_of(source.folder), readiness=readiness, further=tuple(found[1:]))
 
 
 def _check_view(source: Source, photos: Photos, calibration: Calibration, is_part: bool) -> CaptureCheck:
@@ -143,7 +144,7 @@ def _check_view(source: Source, photos: Photos, calibration: Calibration, is_par
     readiness = judge(calibration, findings, cover, doubts, is_part)
     notes = tuple(map(str, calibration.residuals.get("notes", [])))
     back = None if source.session is None else source.session.phone_back
-    return CaptureCheck(source.folder.resolve().name, readiness, calibration, findings, cover, notes, back)
+    return CaptureCheck(title_of(source.folder), readiness, calibration, findings, cover, notes, back)
 
 
 def with_power_changes(findings: Sequence[Finding], calibration: Calibration, stack: PhotoStack) -> tuple[Finding, ...]:

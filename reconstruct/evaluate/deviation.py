@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from calibration.calibration import load_calibration
 from capture.errors import ReconstructionError
 from capture.files.regular import why
+from capture.files.title import title_of
 from reconstruct.evaluate.surface_distance import ICP_POINTS, Similarity, register, signed_distance_to_mesh
 from reconstruct.mesh.mesh import MM_PER_METRE
 from reconstruct.stored_run.ply import read_mesh
@@ -57,7 +58,7 @@ def load_reference(path: Path) -> ReferenceMesh:
     if has_metres:
         mesh = trimesh.Trimesh(mesh.vertices @ Z_UP.T, mesh.faces, process=False)
     unit = load_calibration(path / "calibration.json").unit if (path / "calibration.json").is_file() else None
-    return ReferenceMesh(path.resolve().name, mesh, unit, has_metres)
+    return ReferenceMesh(title_of(path), mesh, unit, has_metres)
 
 
 def in_unit(reference: ReferenceMesh, unit: str) -> trimesh.Trimesh:

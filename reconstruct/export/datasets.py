@@ -19,6 +19,7 @@ from calibration.lights.layouts import BLENDER
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_folder, write_json
+from capture.files.title import file_stem
 from capture.photos.photo import encode_srgb, write_picture
 from reconstruct.export.dataset import Dataset, centred, kind_of, light_matrix, open_dataset, opengl
 from reconstruct.export.export import Contents, ExportOptions, OnProgress
@@ -85,7 +86,7 @@ def write_rti(data: Dataset, out: Path, on_progress: OnProgress) -> None:
     places = rows if kind == "point" else directions * away
     files = [f"{stem}.jpg" for stem in data.stems]
     _pictures(data, data.camera, out, ".jpg", on_progress)
-    name = data.run.name
+    name = file_stem(data.run.run_dir)
     lines = [f"{file} {x:.7f} {y:.7f} {z:.7f}" for file, (x, y, z) in zip(files, directions.tolist(), strict=True)]
     (out / f"{name}.lp").write_text("\n".join([str(len(files)), *lines]) + "\n", encoding="utf-8")
     dome = {

@@ -11,6 +11,7 @@ from typing import Any
 
 from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_file
+from capture.files.title import file_stem
 from reconstruct.export.formats import FORMATS
 from reconstruct.stored_run.stored_run import MESH, StoredRun
 
@@ -117,12 +118,12 @@ def format_for(file: Path | None, name: str | None) -> str:
 
 
 def default_file(run_dir: Path, name: str) -> Path:
-    """Return a format's default file, RUN/exports/RUN.suffix; videos are .webm if .mp4 cannot be written."""
+    """Return a format's default file, RUN/exports/TITLE.suffix; videos are .webm if .mp4 cannot be written."""
     from reconstruct.export.video import can_write_mp4
 
     row = FORMATS[name]
     suffix = ".webm" if row.suffix == ".mp4" and not can_write_mp4() else row.suffix
-    return StoredRun(run_dir).exports() / f"{run_dir.resolve().name}{row.ending}{suffix}"
+    return StoredRun(run_dir).exports() / f"{file_stem(run_dir)}{row.ending}{suffix}"
 
 
 def export(

@@ -15,6 +15,7 @@ from capture.decode.exr import exr_size, write_exr
 from capture.decode.limits import BrokenFile
 from capture.decode.panorama import read_panorama
 from capture.errors import ReconstructionError
+from capture.files.title import file_stem
 from capture.photos.photo import encode_srgb
 from reconstruct.detail.sample import with_detail
 from reconstruct.export.export import Contents, ExportOptions, OnProgress
@@ -58,7 +59,7 @@ class NewLight:
 
 
 def relit_file(run_dir: Path, new: NewLight, out: Path | None) -> Path:
-    """Return the output file: as named, or RUN/exports/RUN_relit.png (.webm).
+    """Return the output file: as named, or RUN/exports/TITLE_relit.png (.webm).
 
     Raises:
         ReconstructionError: its ending does not fit the requested light.
@@ -66,7 +67,7 @@ def relit_file(run_dir: Path, new: NewLight, out: Path | None) -> Path:
     endings = STILLS if new.orbit is None else FILMS
     if out is None:
         run = StoredRun(run_dir)
-        return run.exports() / f"{run.name}_relit{'.png' if new.orbit is None else '.webm'}"
+        return run.exports() / f"{file_stem(run_dir)}_relit{'.png' if new.orbit is None else '.webm'}"
     if out.suffix.lower() not in endings:
         kind = "a picture" if new.orbit is None else "a turn of the light"
         raise ReconstructionError(f"{out}: {kind} ends in {', '.join(endings)}. Name it so.")

@@ -23,6 +23,7 @@ from PIL import Image
 
 from calibration.calibrated_views import CalibratedViews, load_views, save_views
 from capture.errors import CaptureError
+from capture.files.title import hand_title_on
 from capture.photos.photo import read_thumbnail
 from capture.session.session import FEWEST_LIT
 from reconstruct.check.readiness import refuse_hopeless
@@ -225,6 +226,7 @@ def claim(source: Source, options: RunOptions, run: RunFolder, stages: str, forc
     made_with = {"python": platform.python_version(), "system": platform.system(), **versions()}
     hashes = content_hash(source.files(options))
     run.claim(hashes, {name: getattr(options, name) for name in names}, force, made_with)
+    hand_title_on(source.folder, run.path)
 
 
 def refuse_device(options: RunOptions) -> None:

@@ -10,6 +10,7 @@ from calibration.calibrated_views import load_views
 from calibration.calibration import Calibration, load_calibration
 from capture.errors import ReconstructionError
 from capture.files.regular import is_own_folder
+from capture.files.title import title_of
 from reconstruct.stored_run.documents import MANIFEST, REPORT, read_manifest, read_report
 from reconstruct.stored_run.maps import Maps, read_maps
 from reconstruct.stored_run.ply import read_mesh
@@ -38,8 +39,8 @@ class StoredRun:
 
     @property
     def name(self) -> str:
-        """The name of the run's folder."""
-        return self.run_dir.resolve().name
+        """The run's title: what a person called it, else the name of its folder."""
+        return title_of(self.run_dir)
 
     @property
     def unit(self) -> str:

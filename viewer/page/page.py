@@ -16,6 +16,7 @@ import viser
 from calibration.calibrated_views import CalibratedView, load_views
 from calibration.calibration import Calibration
 from capture.errors import UserError
+from capture.files.title import title_of
 from reconstruct.run_folder.cost import give_memory_back
 from reconstruct.run_folder.folder import LOG
 from reconstruct.stored_run.ply import read_mesh, read_preview
@@ -115,7 +116,7 @@ class Page:
         self._kept = kept or KeptReadings()
         self.server = server
         self.is_over = False
-        self.controls = Controls(server, run_dir.resolve().name, self._show_layers)
+        self.controls = Controls(server, title_of(run_dir), self._show_layers)
         self._context = PanelContext(
             server=server,
             run_dir=run_dir,

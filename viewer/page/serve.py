@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from capture.files.title import title_of
 from reconstruct.run.bundle import user_name
 from reconstruct.run_folder.cost import give_memory_back, share_memory_among_threads
 from reconstruct.stored_run.refusal import refuse_no_run
@@ -48,7 +49,7 @@ def view(
         compared_with = load_reference(Path(reference))
     share_memory_among_threads()
     stage = StageFiles(Path(run_dir), "socket", home="/")
-    server = GuardedServer(host, port, stage, f"{Path(run_dir).resolve().name} - Shadowgraph")
+    server = GuardedServer(host, port, stage, f"{title_of(Path(run_dir))} - Shadowgraph")
     visitors = Visitors(Path(run_dir), server, compared_with)
     gc.freeze()  # objects made by imports stay; without this each collection would scan them for 0.15 s
     start = "stage/" if stage.is_ready else ""

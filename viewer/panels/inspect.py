@@ -7,6 +7,7 @@ import trimesh
 import viser
 from jaxtyping import UInt8
 
+from capture.files.title import title_of
 from reconstruct.evaluate.deviation import ReferenceMesh, best_fit, deviations, in_unit, summary
 from reconstruct.mesh.evidence import VertexEvidence, vertex_evidence
 from reconstruct.sdf.measure import PickedPoint, sigma_at
@@ -134,7 +135,7 @@ def compared(result: Result, mesh: trimesh.Trimesh, reference: ReferenceMesh, is
         motion = best_fit(other, mesh)
         other = trimesh.Trimesh(motion.apply(np.asarray(other.vertices)), other.faces, process=False)
     distance = deviations(mesh, other)
-    is_namesake = reference.name == result.run_dir.resolve().name  # another run of the same photos, as a rule
+    is_namesake = reference.name == title_of(result.run_dir)  # another run of the same photos, as a rule
     name = "the other run" if is_namesake else reference.name
     return by_distance(distance, summary(mesh, distance), unit, name)
 

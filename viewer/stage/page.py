@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from capture.errors import ReconstructionError
+from capture.files.title import title_of
 from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, OnProgress
 from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
 from reconstruct.stored_run.stage_pack import StagePack, addressed
@@ -65,7 +66,7 @@ def page_html(run_dir: Path, pack: StagePack, addresses: Mapping[str, str], save
         saves: how its document can be kept with the run: "put" (HTTP) or "socket"; "": it cannot.
         home: address of the page that led here; "": none.
     """
-    name, facts = run_dir.resolve().name, addressed(pack.facts, addresses)
+    name, facts = title_of(run_dir), addressed(pack.facts, addresses)
     script, style = script_text(), _asset("stage.css").replace("{{background}}", BACKGROUND)
     values = {
         "title": html.escape(name),

@@ -1,6 +1,6 @@
 """The studio: captures and runs of a folder in the browser, from a phone in the hand to a thing on the screen.
 
-One idea: the folder is the truth. Captures, runs and what the studio keeps (`.studio/`: queue, files under way, titles,
+One idea: the folder is the truth. Captures, runs and what the studio keeps (`.studio/`: queue, files under way,
 trash) are files that are written whole; the server holds nothing else, so it can be killed and started again, and
 browsers only ask what is there. Work is done by other processes: runs by the queue of reconstruct/run, one at a time
 and detached; checks by `shadowgraph check`; pictures and first looks by a helper process. Strangers' photos are

@@ -8,14 +8,14 @@ from capture.errors import CaptureError, UserError
 from capture.files.atomic import read_json, write_json
 from capture.files.json_field import JsonField
 from capture.files.regular import is_own_folder
-from capture.intake.arrivals import safe_name
+from capture.files.title import as_name, keep_title
 from reconstruct.run.batch import looks_like_capture
 from reconstruct.run_folder.folder import LOG
 from reconstruct.run_folder.lock import LOCK, lock_holder, release_lock, take_lock
 from reconstruct.stored_run.documents import MANIFEST
 
 KEPT, CAPTURES, RUNS = ".studio", "captures", "runs"
-ADDRESS, NOTES = "address.json", "notes.json"
+ADDRESS, ADDED = "address.json", "added.json"
 TOKEN_BYTES = 24
 PRIVATE = 0o700
 MOST_LOOKED_INTO = 50  # folders, to find out whether a folder is one for a studio
@@ -137,13 +137,14 @@ class StudioFolder:
         return path.relative_to(self.root).as_posix()
 
     def new_capture(self, title: str) -> Path:
-        """Make an empty capture named after its title.
+        """Make an empty capture with this title, in a folder that is named after it.
 
         Raises:
-            CaptureError: nothing in the title can be a name.
+            CaptureError: the title has no letter.
         """
-        name = safe_name(title.strip() or "capture").replace(" ", "-")
-        return _made(self.root / CAPTURES / name)
+        capture = _made(self.root / CAPTURES / as_name(title, "capture").replace(" ", "-"))
+        keep_title(capture, title)
+        return capture
 
     def new_run(self, capture: Path, preset: str, taken: set[str]) -> Path:
         """Return a folder for a new run of a capture, which does not exist yet; names in `taken` are promised."""
@@ -177,8 +178,7 @@ class StudioFolder:
         if path == self.root or not is_capture(path):
             raise CaptureError(f"{key[:80]!r} holds no photos, no clip, no photos/; a capture was needed.")
         if self.key(path) not in self.captures():
-            notes = Notes(self.kept / NOTES)
-            notes.set("added", self.key(path), self.key(path))
+            write_json(self.kept / ADDED, [*self._keys_added(), self.key(path)])
         return self.key(path)
 
     def _below(self, key: str) -> Path:
@@ -191,8 +191,14 @@ class StudioFolder:
         return path
 
     def _added(self) -> list[Path]:
-        keys = Notes(self.kept / NOTES).all("added")
+        keys = self._keys_added()
         return [path for key in keys if (path := self.root / key).is_dir() and path.resolve().is_relative_to(self.root)]
+
+    def _keys_added(self) -> list[str]:
+        try:
+            return [key.text() for key in JsonField(read_json(self.kept / ADDED), ADDED).entries()]
+        except (OSError, ValueError, UserError):
+            return []
 
     def _folders(self, place: Path) -> list[Path]:
         """Return the folders in a place that are not hidden and do not lead outside, at most MOST_FOLDERS."""
@@ -201,34 +207,6 @@ class StudioFolder:
         except OSError:
             return []
         return [path for path in found[:MOST_FOLDERS] if path.resolve().is_relative_to(self.root)]
-
-
-class Notes:
-    """Small texts about captures and runs by group and key, in one file: titles, folders that were added."""
-
-    def __init__(self, file: Path):
-        """Read the file; one that is damaged holds nothing."""
-        self._file = file
-
-    def all(self, group: str) -> dict[str, str]:
-        """Return the texts of a group by their keys."""
-        return dict(self._read().get(group, {}))
-
-    def set(self, group: str, key: str, text: str | None) -> None:
-        """Keep a text; None: forget it."""
-        groups = self._read()
-        texts = groups.setdefault(group, {})
-        texts.pop(key, None)
-        if text is not None:
-            texts[key] = text
-        write_json(self._file, groups)
-
-    def _read(self) -> dict[str, dict[str, str]]:
-        try:
-            groups = JsonField(read_json(self._file), str(self._file)).items()
-            return {name: {key: entry.text() for key, entry in group.items().items()} for name, group in groups.items()}
-        except (OSError, ValueError, UserError):
-            return {}
 
 
 def is_run(folder: Path) -> bool:

@@ -7,6 +7,7 @@ from typing import Any
 
 from capture.errors import UserError
 from capture.files.regular import is_regular
+from capture.files.title import title_of
 from capture.intake.parts import Parts
 from capture.session.contents import clips_of, photos_of
 from capture.session.session import load_settings
@@ -15,13 +16,12 @@ from reconstruct.run_folder.folder import LOG
 from reconstruct.stored_run.documents import CHECK, REPORT, read_check, read_manifest, read_report
 from viewer.display.run_follower import RunFollower
 from viewer.studio.checking import Checks
-from viewer.studio.folder import NOTES, Notes, StudioFolder
+from viewer.studio.folder import StudioFolder
 from viewer.studio.growing import mark_of
 from viewer.studio.page_words import in_page_words
 from viewer.studio.progress import run_progress
 
 PRESETS = ("draft", "standard", "fine", "paper")
-TITLES = "titles"
 ARRIVING_S = 4.0  # after the last photo, the capture still counts as arriving
 
 
@@ -31,25 +31,23 @@ class Library:
     def __init__(self, folder: StudioFolder, queue: Queue, parts: Parts, checks: Checks):
         """Read nothing yet."""
         self.folder, self._queue, self._parts, self._checks = folder, queue, parts, checks
-        self.notes = Notes(folder.kept / NOTES)
         self._followers: dict[Path, RunFollower] = {}
         self._documents: dict[Path, tuple[tuple[int, int], dict[str, Any]]] = {}
 
     def cards(self) -> list[dict[str, Any]]:
         """Return a card for each capture with its runs, and for each run whose capture is not here; newest first."""
         captures, runs = self.folder.captures(), self.folder.runs()
-        titles = self.notes.all(TITLES)
         asked = {job.run: job for job in self._queue.jobs}
-        rows = {key: self.run_row(key, path, asked.get(path), titles) for key, path in runs.items()}
+        rows = {key: self.run_row(key, path, asked.get(path)) for key, path in runs.items()}
         for path, job in asked.items():  # jobs that have no folder yet, or never got one
             if path not in runs.values() and job.state != FINISHED:
                 key = self.folder.key(path)
-                rows[key] = self.run_row(key, path, job, titles)
+                rows[key] = self.run_row(key, path, job)
         cards = []
         for key, path in captures.items():
             mine = [name for name, row in rows.items() if self._belongs(path, self.folder.root / name, row, asked)]
             own = sorted((rows.pop(name) for name in mine), key=lambda row: -row["date"])
-            cards.append(self._card(key, path, own, titles))
+            cards.append(self._card(key, path, own))
         for key, row in rows.items():
             cards.append({"kind": "run", "key": key, "title": row["title"], "date": row["date"], "runs": [row]})
         return sorted(cards, key=lambda card: -card["date"])
@@ -81,7 +79,7 @@ class Library:
             "coach": {"lights": coach["lights"], "advice": coach["advice"]},
         }
 
-    def run_row(self, key: str, path: Path, job: Job | None, titles: dict[str, str]) -> dict[str, Any]:
+    def run_row(self, key: str, path: Path, job: Job | None) -> dict[str, Any]:
         """Return what a card shows of one run."""
         follower = self._followers.setdefault(path, RunFollower(path))
         changed = _time_of(path / LOG) or (job.asked if job else 0.0)
@@ -96,7 +94,7 @@ class Library:
         state, sentence = _state(job, now.is_running, now.is_finished, now.title)
         return {
             "key": key,
-            "title": titles.get(key, path.name),
+            "title": title_of(path, *([Path(job.task.capture)] if job else [])),
             "state": state,
             "sentence": in_page_words(sentence),
             "job": job.id if job else "",
@@ -114,7 +112,7 @@ class Library:
             "has_mesh": is_regular(path / "mesh.ply"),
         }
 
-    def _card(self, key: str, path: Path, runs: list[dict[str, Any]], titles: dict[str, str]) -> dict[str, Any]:
+    def _card(self, key: str, path: Path, runs: list[dict[str, Any]]) -> dict[str, Any]:
         photos = photos_of(path)
         newest = max((_time_of(photo) for photo in photos), default=_time_of(path))
         under_way = self._parts.under_way(key)
@@ -128,7 +126,7 @@ class Library:
         return {
             "kind": "capture",
             "key": key,
-            "title": titles.get(key, path.name),
+            "title": title_of(path),
             "state": state,
             "count": len(photos) + len(clips_of(path)),
             "coming": len(under_way),

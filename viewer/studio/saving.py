@@ -13,12 +13,13 @@ from typing import Any
 
 from capture.errors import CaptureError
 from capture.files.regular import is_own_folder, is_regular
+from capture.files.title import TITLE, title_of
 from viewer.report.formats import FORMATS
 from viewer.studio.folder import StudioFolder
 from viewer.studio.helper import Helper
 from viewer.studio.page_words import in_page_words
 
-MADE_OF = ("mesh.ply", "fields.safetensors", "detail.safetensors", "stage.json")  # what an export shows
+MADE_OF = ("mesh.ply", "fields.safetensors", "detail.safetensors", "stage.json", TITLE)  # what an export shows
 LONGEST_SIZE = 12  # letters of a number
 
 
@@ -143,7 +144,7 @@ class Saving:
         """
         run = self._folder.run(key)
         if not is_regular(run / "mesh.ply"):
-            raise CaptureError(f"{run.name} has no result yet that could be saved.")
+            raise CaptureError(f"{title_of(run)} has no result yet that could be saved.")
         return run
 
 

@@ -14,6 +14,7 @@ from typing import Any
 from capture.decode.formats import read_size
 from capture.errors import CaptureError, UserError
 from capture.files.regular import is_regular
+from capture.files.title import keep_title, title_of
 from capture.intake.arrivals import KEEP_FREE, refuse_full_disk
 from capture.intake.parts import Parts
 from capture.session.contents import clips_of, photos_of
@@ -26,19 +27,19 @@ from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder
 from viewer.studio.growing import Growing
 from viewer.studio.helper import Helper
-from viewer.studio.library import TITLES, Library
+from viewer.studio.library import Library
 from viewer.studio.live_pages import LivePages
 from viewer.studio.saving import Saving
 from viewer.studio.trash import Trash
 
 TICK_S = 0.5
 LEAVING_S = 5.0  # that a step may take to its end when the studio closes; files that are cut off go on the next time
-LONGEST_TITLE = 120  # letters
 PICTURE_PX, RUN_PICTURE_PX = 320, 640
 USUAL = (36, 4032, 3024)  # photos, and their px, where none are there yet: a phone's
 MOST_MEASURED = 8  # captures whose predicted costs are kept
 MOST_STAGES = 4  # runs whose stages stay in memory: each takes a few megabytes
 PRESETS = ("draft", "standard", "fine")
+REPORT_PAGE = "report.html"
 
 
 class Studio:
@@ -149,7 +150,7 @@ class Studio:
         if row is not None and job.state == RUNNING:
             now = row["progress"]
             left = now["left_s"] if now["left_s"] is not None else left and max(0.0, left - now["elapsed_s"])
-        title = row["title"] if row is not None else job.run.name
+        title = row["title"] if row is not None else title_of(job.run, Path(job.task.capture))
         known = {"id": job.id, "run": key, "title": title, "state": job.state, "preset": preset}
         return known | {"left_s": left, "bytes": cost.get("bytes")}
 
@@ -197,7 +198,7 @@ class Studio:
         try:
             stat = file.stat()
         except OSError as error:
-            raise CaptureError(f"{what.name} has no result yet that could be shown.") from error
+            raise CaptureError(f"{title_of(what)} has no result yet that could be shown.") from error
         name = sha256(f"{what} {stat.st_size} {stat.st_mtime_ns}".encode()).hexdigest()[:24]
         return self.folder.kept / "pictures" / f"{name}.jpg"
 
@@ -212,30 +213,33 @@ class Studio:
 
     def new_capture(self, title: str) -> str:
         """Make an empty capture and return its key."""
-        title = _title(title)
         with self._lock:
-            key = self.folder.key(self.folder.new_capture(title))
-            self.library.notes.set(TITLES, key, title)
-            return key
+            return self.folder.key(self.folder.new_capture(title))
 
     def rename(self, key: str, title: str) -> None:
-        """Give a capture or run another title; its folder keeps its name."""
+        """Give a capture, and its runs that have the same title, or a run another one; folders keep their names."""
         with self._lock:
-            self._find(key)
-            self.library.notes.set(TITLES, key, _title(title))
+            path = self._find(key)
+            before = title_of(path)
+            mine = next((card["runs"] for card in self.library.cards() if card["key"] == key), [])
+            runs = [self.folder.root / row["key"] for row in mine if row["title"] == before]
+            for place in (path, *filter(Path.is_dir, runs)):
+                keep_title(place, title)
+                if is_regular(place / REPORT_PAGE):
+                    self.pictures.ask("report", run=str(place))
 
     def delete(self, key: str) -> None:
         """Move a capture or run into the trash."""
         with self._lock:
             path = self._find(key)
             if any(job.is_open and path in (job.run, Path(job.task.capture)) for job in self.queue.jobs):
-                raise CaptureError(f"{path.name} runs or waits in the queue; stop that first.")
+                raise CaptureError(f"{title_of(path)} runs or waits in the queue; stop that first.")
             if key in self.folder.runs() and self.library.run_row(key, path, None, {})["progress"]["is_running"]:
-                raise CaptureError(f"{path.name} is running in another window or terminal; stop it there first.")
+                raise CaptureError(f"{title_of(path)} is running in another window or terminal; stop it there first.")
             self.checks.forget(path)
             for part in self.parts.under_way(key):
                 self.parts.drop(part)
-            self.trash.put(path, self.library.notes.all(TITLES).get(key, path.name))
+            self.trash.put(path, title_of(path))
             self.queue.forget(path)
 
     def empty_trash(self) -> int:
@@ -260,7 +264,7 @@ class Studio:
         names = {path.relative_to(capture).as_posix(): path for path in (*photos_of(capture), *clips_of(capture))}
         if photo not in names:
             raise CaptureError("This photo is gone.")
-        self.trash.put(names[photo], f"{photo} of {capture.name}")
+        self.trash.put(names[photo], f"{photo} of {title_of(capture)}")
 
     def set_board(self, key: str, spec: str) -> None:
         """Say which board the photos show."""
@@ -333,10 +337,3 @@ class Studio:
             self._faults[step] = text
             with contextlib.suppress(OSError):  # the disk may be full
                 (self.folder.kept / f"fault_{step.strip('_')}.txt").write_text(text, "utf-8", "replace")
-
-
-def _title(text: str) -> str:
-    title = " ".join(text.split())[:LONGEST_TITLE]
-    if not title:
-        raise CaptureError("A title of at least one letter is needed.")
-    return title

@@ -136,6 +136,13 @@ def save(
         tempfile.tempdir = None
 
 
+def report(run: str) -> None:
+    """Write the report of a run that has another title now."""
+    from viewer.report.report import write_report
+
+    write_report(Path(run))
+
+
 def pack(run: str, out: str) -> None:
     """Pack the stage of a finished run that holds none."""
     from viewer.stage.pack_file import write_stage
@@ -148,7 +155,7 @@ def _save(picture: Image.Image, out: Path) -> None:
         picture.convert("RGB").save(temporary, "JPEG", quality=JPEG_QUALITY)
 
 
-TASKS = {task.__name__: task for task in (thumbnail, look, presets, run_picture, growing, save, pack)}
+TASKS = {task.__name__: task for task in (thumbnail, look, presets, run_picture, growing, save, pack, report)}
 
 if __name__ == "__main__":
     answer_lines(TASKS)

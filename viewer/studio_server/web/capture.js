@@ -1,6 +1,6 @@
 // One capture: its board, its photos as they arrive, the verdict, and the start of a run.
 
-import { PRESETS, about, ask as question, attempt, bytes, change, day, dialog, duration, failure, h, key, picture, plural, size, toast } from "./dom.js";
+import { PRESETS, about, ask as question, attempt, bytes, change, day, dialog, duration, failure, h, key, picture, plural, presetWords, size, toast } from "./dom.js";
 import { boardOnScreen, printLink } from "./board.js";
 import { dome } from "./hemisphere.js";
 import { phones } from "./phones.js";
@@ -166,7 +166,7 @@ export function capture(name, again) {
   function runsPanel(row) {
     if (!row.runs.length) return null;
     return h("section", { class: "panel" }, h("h2", {}, "Runs"), h("ul", { class: "plain" }, row.runs.map((run) => h("li", { key: run.key },
-      h("a", { href: `#/run/${key(run.key)}` }, run.title), ` ${run.state}`, run.state === "running" && `, ${Math.round(100 * run.progress.share)} %`,
+      h("a", { href: `#/run/${key(run.key)}` }, run.title === row.title ? presetWords(run.preset) : run.title), ` ${run.state}`, run.state === "running" && `, ${Math.round(100 * run.progress.share)} %`,
       run.size && `, ${size(run)}`, h("span", { class: "quiet small" }, ` ${run.state === "finished" ? duration(run.progress.elapsed_s) : day(run.date)}`),
       run.state === "failed" && h("div", { class: "bad small" }, run.sentence)))));
   }

@@ -1,6 +1,6 @@
 // The runs that wait for this machine: which one is at work, what each takes, and when all are done.
 
-import { about, attempt, bytes, change, duration, h, key } from "./dom.js";
+import { about, attempt, bytes, change, duration, h, key, presetWords } from "./dom.js";
 
 /** `jobs`: in the order in which they run; `again` draws the page anew. */
 export function queue(jobs, again) {
@@ -11,7 +11,7 @@ export function queue(jobs, again) {
   return h("section", { class: "panel queue", key: "queue" }, h("h2", {}, "At work"),
     h("p", { class: "quiet" }, `One run at a time, ${jobs.length} in the queue; ${told}.`),
     h("ol", { class: "plain" }, jobs.map((job, place) => h("li", { key: job.id },
-      h("a", { href: `#/run/${key(job.run)}` }, job.title), ` ${cost(job)} `,
+      h("a", { href: `#/run/${key(job.run)}` }, `${job.title}, ${presetWords(job.preset).toLowerCase()}`), ` ${cost(job)} `,
       job.state === "waiting" && place > 1 && h("button", { "aria-label": `Next in line: ${job.title}`, onclick: () => act(job, "first") }, "Next in line"), " ",
       stop(job)))));
 

@@ -1,0 +1,180 @@
+"""What a person meets first in the studio: something to relight, the example, one button to share, keys that work."""
+
+from pathlib import Path
+
+import pytest
+from chromium import CHROMIUM, wait_until
+from studio_client import served
+from test_studio import capture_in, program, run_in  # noqa: F401  a fixture
+from test_studio_browser import DESKTOP, PHONE, RULES, browser, opened  # noqa: F401  a fixture
+
+from capture.errors import CaptureError
+from capture.session.contents import photos_of
+from capture.session.session import load_settings
+from reconstruct.stored_run.stage_pack import opened_pack
+from viewer.studio import example, studio
+
+on_a_page = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
+]
+STATE = "window.shadowgraph ? window.shadowgraph.state() : null"
+SMALL = {"width": 1000, "height": 640}
+SIZES = {"desktop": DESKTOP, "phone": PHONE, "small": SMALL}
+
+
+def marked(test):
+    for mark in on_a_page:
+        test = mark(test)
+    return test
+
+
+def stage_of(tab):
+    """The frame of a result once it answers."""
+    tab.frame_locator("iframe.result").locator("#picture").wait_for()
+    frame = tab.frames[-1]
+    wait_until(tab, lambda: frame.evaluate(STATE) is not None)
+    tab.frame_locator("iframe.result").locator("#first").wait_for(state="detached")
+    return frame
+
+
+# --- the example -----------------------------------------------------------------------------------------------------
+
+
+def test_the_example_that_ships_is_small_and_of_the_stage_as_it_is():
+    assert opened_pack(example.RESULT), "another format: make it anew with .ci/example_result.py"
+    assert example.RESULT.stat().st_size < 500_000
+
+
+def test_the_example_is_a_capture_and_a_run_of_its_own_each_time(tmp_path, program):  # noqa: F811
+    with served(tmp_path, program) as (_, _, owner):
+        runs = [owner.ok("try_example") for _ in range(3)]
+        cards = {card["key"]: card for card in owner.get("/api/state")[1]["cards"]}
+    assert len(set(runs)) == len(cards) == 3
+    for key, card in cards.items():
+        assert card["title"] == example.TITLE and len(card["runs"]) == 1
+        assert len(photos_of(tmp_path / key)) == card["count"] == 45 and load_settings(tmp_path / key).board
+
+
+def test_an_installation_without_the_examples_photos_says_so(tmp_path, monkeypatch):
+    def missing() -> Path:
+        raise CaptureError("The example's photos did not come with this installation.")
+
+    monkeypatch.setattr(studio, "example_photos", missing)
+    with served(tmp_path) as (_, _, owner):
+        status, answer = owner.post("try_example")
+    assert status == 400 and "did not come" in answer["error"] and not (tmp_path / "captures").exists()
+
+
+@pytest.mark.parametrize("size", SIZES)
+@marked
+def test_an_empty_studio_shows_a_result_that_the_pointer_lights(browser, tmp_path, size):  # noqa: F811
+    with served(tmp_path) as (_, _, owner):
+        tab, bad = opened(browser, owner, SIZES[size], is_drawn=False)
+        stage = stage_of(tab)
+        box = tab.locator("iframe.result").bounding_box()
+        before = stage.evaluate(STATE)["lamp"]
+        tab.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.6 * box["height"])
+        tab.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 0.5 * box["height"], steps=3)
+        wait_until(tab, lambda: stage.evaluate(STATE)["lamp"]["azimuth"] != before["azimuth"])
+        for words in ("New capture", "Try the example"):
+            place = tab.locator(f"button:has-text('{words}')").bounding_box()
+            assert place["y"] + place["height"] < SIZES[size]["height"], f"{words} is below the first screen"
+        assert not tab.evaluate(RULES) and not bad
+
+
+# --- a result --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def folder(finished_run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("studio")
+    finished_run(folder / "runs", has_stage=True)
+    capture_in(folder, "vase")
+    run_in(folder, "vase", is_finished=False, message="a level")
+    return folder
+
+
+def result_of(browser, owner, size):  # noqa: F811
+    tab, bad = opened(browser, owner, size, is_drawn=False)
+    tab.goto(f"http://127.0.0.1:{owner.port}/#/run/runs%2Fheap")
+    return tab, bad, stage_of(tab)
+
+
+@marked
+def test_one_click_makes_and_downloads_the_page_under_the_title(browser, folder):  # noqa: F811
+    with served(folder) as (_, _, owner):
+        for title in ("Übung 1", "A cup & saucer", "heap"):
+            owner.ok("rename", key="runs/heap", title=title)
+            tab, bad, _ = result_of(browser, owner, DESKTOP)
+            with tab.expect_download() as download:
+                tab.click("button:has-text('Share')")
+            assert download.value.suggested_filename == f"{title}.html"
+            page = Path(download.value.path()).read_text()
+            assert "connect-src 'none'" in page and not bad
+            tab.wait_for_selector("button:has-text('Share'):not([disabled])")
+            tab.close()
+
+
+@pytest.mark.parametrize("button", ["Fill the window", "Rename", "Inspect in 3D", "All captures"])
+@marked
+def test_keys_reach_the_result_while_a_button_has_the_focus(browser, folder, button):  # noqa: F811
+    with served(folder) as (_, _, owner):
+        tab, bad, stage = result_of(browser, owner, SMALL)
+        tab.locator(f".bar > :has-text('{button}')").focus()
+        for keys, part, name in (
+            ("ArrowRight", "lamp", "azimuth"),
+            ("Shift+ArrowRight", "view", "azimuth"),
+            ("+", "view", "distance"),
+            ("2", "shown", "look"),
+        ):
+            before = stage.evaluate(STATE)
+            tab.keyboard.press(keys)
+            wait_until(tab, lambda b=before, p=part, n=name: stage.evaluate(STATE)[p][n] != b[p][n])
+        assert button in tab.evaluate("document.activeElement.innerText") and not bad
+
+
+@marked
+def test_keys_that_are_typed_into_a_field_stay_there(browser, folder):  # noqa: F811
+    with served(folder) as (_, _, owner):
+        tab, _, stage = result_of(browser, owner, DESKTOP)
+        before = stage.evaluate(STATE)
+        tab.select_option("section.save select", "stl")
+        tab.focus("section.save input")
+        for keys in ("2", "5", "ArrowUp"):
+            tab.keyboard.press(keys)
+        tab.click("button:has-text('Rename')")
+        tab.keyboard.type("+l2")
+        assert tab.input_value("section.save input") and tab.input_value("dialog input") == "+l2"
+        now = stage.evaluate(STATE)
+        assert (now["lamp"], now["view"], now["shown"]) == (before["lamp"], before["view"], before["shown"])
+
+
+@pytest.mark.parametrize("width, height", [(390, 844), (360, 640), (412, 915), (1000, 640)])
+@marked
+def test_nothing_to_press_stands_before_the_model(browser, folder, width, height):  # noqa: F811
+    with served(folder) as (_, _, owner):
+        tab, bad, _ = result_of(browser, owner, {"width": width, "height": height})
+        model = tab.locator("iframe.result").bounding_box()
+        assert model["y"] < 0.2 * height and model["height"] > 0.6 * height
+        tops = tab.eval_on_selector_all(
+            "main button, main a.button", "all => all.map(e => e.getBoundingClientRect().top)"
+        )
+        assert min(tops) >= model["y"] + model["height"] and not tab.evaluate(RULES) and not bad
+
+
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+@marked
+def test_every_text_stands_out_also_on_buttons_that_cannot_be_pressed(browser, folder, scheme):  # noqa: F811
+    with served(folder) as (_, _, owner):
+        tab, _ = opened(browser, owner, DESKTOP, is_drawn=False)
+        tab.emulate_media(color_scheme=scheme)
+        for page, ready in {
+            "": ".card",
+            "capture/vase": ".verdict",
+            "run/runs%2Fvase": "h2",
+            "run/runs%2Fheap": ".save",
+        }.items():
+            tab.goto(f"http://127.0.0.1:{owner.port}/#/{page}")
+            tab.wait_for_selector(f"main {ready}")
+            assert not tab.evaluate(RULES), page
