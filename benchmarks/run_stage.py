@@ -106,7 +106,7 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("run", type=Path, help="the folder of a finished run")
     asked = parser.parse_args()
-    files = StageFiles(asked.run)
+    files = StageFiles(asked.run, "socket")
     files.warm()
     server = GuardedServer("127.0.0.1", 0, files)
     lines = ["| window | first paint | object fills | pointer to picture | orbit | CPU, light / orbit | load |"]

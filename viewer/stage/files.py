@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from capture.errors import ReconstructionError, UserError
-from reconstruct.stored_run.stage_document import save_stage_document
+from capture.files.title import title_of
+from reconstruct.stored_run.stage_document import read_stage_document, save_stage_document
 from reconstruct.stored_run.stage_pack import StagePack
 from reconstruct.stored_run.stored_run import FIELDS, MESH
 from viewer.stage.pack_file import is_finished, kind_of, stage_pack, stored_stage
@@ -32,15 +33,16 @@ class StageFile:
 class StageFiles:
     """The stage of one run folder. It can be asked from any thread; what the run has not packed is packed when asked.
 
-    A server asks `get` for GET requests below the page's address, sends HEADERS with them, and hands the body of
-    PUT stage.json to `save`.
+    A server asks `get` for GET requests below the page's address, sends HEADERS with them, and hands the document that
+    comes back to `save`.
     """
 
-    def __init__(self, run_dir: Path, saves: str = "put", home: str = "", spare: Path | None = None):
+    def __init__(self, run_dir: Path, saves: str = "", home: str = "", spare: Path | None = None):
         """Read nothing yet.
 
         Args:
-            saves: how the page sends its document: "put" (HTTP), "socket" (WebSocket stage.json); "": it cannot.
+            saves: how the page sends its document: "socket" (WebSocket stage.json), "frame" (a message to the page
+                around it: this one has no origin, and all its parts in it); "": it cannot.
             home: address of the page that leads here, for a link back; "": none.
             spare: a file that may hold the packed stage of a run whose folder has none.
         """
@@ -66,8 +68,9 @@ class StageFiles:
             if name in PAGE:
                 from viewer.stage.page import page_html
 
-                addresses = {part: part for part in pack.names}
-                return StageFile(page_html(self.run_dir, pack, addresses, self._saves, self._home).encode(), HTML)
+                document = read_stage_document(self.run_dir)
+                page = page_html(title_of(self.run_dir), pack, document, self._saves, self._home)
+                return StageFile(page.encode(), HTML)
             return StageFile(pack.read(name), kind_of(name)) if name in pack.names else None
 
     def is_packed(self) -> bool:

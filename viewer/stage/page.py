@@ -5,7 +5,6 @@ import hashlib
 import html
 import json
 import re
-from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -53,29 +52,37 @@ def stage_page(run_dir: Path, on_progress: OnProgress = lambda done, total, mess
     """
     on_progress(0, 2, "packing the scene")
     pack = stage_pack(run_dir)
-    addresses = {name: as_address(pack.read(name), kind_of(name)) for name in pack.names}
     on_progress(1, 2, "writing the page")
-    return page_html(run_dir, pack, addresses, saves="")
+    return page_html(title_of(run_dir), pack, read_stage_document(run_dir))
 
 
-def page_html(run_dir: Path, pack: StagePack, addresses: Mapping[str, str], saves: str, home: str = "") -> str:
+def page_html(
+    name: str,
+    pack: StagePack,
+    document: dict[str, Any] | None = None,
+    saves: str = "",
+    home: str = "",
+) -> str:
     """Return the page's HTML.
 
     Args:
-        addresses: of the parts of the pack.
-        saves: how its document can be kept with the run: "put" (HTTP) or "socket"; "": it cannot.
+        document: notes and views, None: none yet.
+        saves: how its document can be kept with the run: "socket", its parts are then beside it, or "frame", the page
+            around it keeps it; "": it cannot.
         home: address of the page that led here; "": none.
     """
-    name, facts = title_of(run_dir), addressed(pack.facts, addresses)
+    is_served = saves == "socket"
+    addresses = {part: part if is_served else as_address(pack.read(part), kind_of(part)) for part in pack.names}
+    facts = addressed(pack.facts, addresses)
     script, style = script_text(), _asset("stage.css").replace("{{background}}", BACKGROUND)
     values = {
         "title": html.escape(name),
         "size": html.escape(str(facts["size"])),
-        "policy": page_policy(is_served=bool(saves)),
+        "policy": page_policy(is_served),
         "style": style,
         "first": html.escape(facts["addresses"]["first"]),
         "scene": _json({**facts, "name": name}),
-        "document": _json(read_stage_document(run_dir) or EMPTY),
+        "document": _json(document or EMPTY),
         "served": _json({"saves": saves, "home": home}),
         "shaders": "\n".join(f'<script type="text/plain" id="{name}">{_shader(name)}</script>' for name in SHADERS),
         "script": script,

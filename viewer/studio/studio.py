@@ -185,7 +185,7 @@ class Studio:
         run = self.folder.run(key)
         spare = self._kept_picture(run, run / "mesh.ply").with_suffix(".zip")
         with self._stage_lock:
-            files = self._stages.pop(run, None) or StageFiles(run, spare=spare)
+            files = self._stages.pop(run, None) or StageFiles(run, "frame", spare=spare)
             self._stages[run] = files
             while len(self._stages) > MOST_STAGES:
                 self._stages.pop(next(iter(self._stages)))

@@ -8,7 +8,6 @@ from typing import Any
 
 from anyio import to_thread
 from starlette.applications import Starlette
-from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
@@ -30,6 +29,10 @@ OWNER_FILES += ("hemisphere.js", "icon.svg", "phones.js", "save.js", "voice.js",
 SAVED = ("format", "size")  # what a request for another kind of file names beside the run
 LARGEST_PICTURE = 1 << 22  # bytes of a run under way: ours have 100 kB
 LARGEST_DOCUMENT = 1 << 26  # bytes of the page of a verdict: ours have some megabytes
+STAGED = HEADERS | {  # of a page that runs the stage's script, and saves pictures and notes
+    "Content-Security-Policy": f"sandbox allow-scripts allow-downloads allow-forms; {page_policy(is_served=False)}; "
+    "frame-ancestors 'self'"
+}
 FRAMED = {"Content-Security-Policy": FRAMED_POLICY, "X-Frame-Options": "SAMEORIGIN"}
 KEPT = {"Cache-Control": "private, max-age=86400"}
 
@@ -72,7 +75,7 @@ def _questions(studio: Studio, phones: Phones) -> list[Route]:
         ask("/api/formats", lambda _: studio.saving.formats()),
         ask("/api/saved", lambda r: studio.saving.asked(_key(r))),
         ask("/download", lambda r: _download(studio.saving.file(_key(r), *(r.query_params.get(n, "") for n in SAVED)))),
-        ask("/stage/{path:path}", lambda r: _stage(studio, r)),
+        ask("/stage/{key:path}/", lambda r: _stage(studio, r)),
         ask("/report", lambda r: _framed(studio.folder.run(_key(r)) / "report.html")),
         ask("/check_page", lambda r: _check_page(studio.checks.page(studio.folder.capture(_key(r))))),
     ]
@@ -117,16 +120,15 @@ def _changes(studio: Studio, phones: Phones) -> list[Route]:
 
 
 def _stage(studio: Studio, request: Request) -> Response:
-    """Return a file of a run's stage; its page may be framed by this studio, and runs its own script alone."""
-    key, _, name = request.path_params["path"].rpartition("/")
-    files = studio.stage(key)
+    """Return the stage of a run, which may be a stranger's: without an origin, and it runs its own script alone."""
+    files = studio.stage(request.path_params["key"])
     if isinstance(files, Future):
         return _made(files, "")
-    found = files.get(name)
-    if found is None:
-        raise HTTPException(404)
-    policy = f"{page_policy(is_served=True)}; frame-ancestors 'self'"
-    return Response(found.content, media_type=found.kind, headers=HEADERS | {"Content-Security-Policy": policy})
+    if request.method == "HEAD":
+        return Response()
+    page = files.get("")
+    assert page is not None
+    return Response(page.content, media_type=page.kind, headers=STAGED)
 
 
 async def _keep_document(studio: Studio, request: Request) -> Response:

@@ -1,6 +1,6 @@
 // A run: its progress while it runs, its result once it is finished; two results side by side.
 
-import { about, attempt, change, dialog, duration, failure, h, key, plural, presetWords, size } from "./dom.js";
+import { about, ask, attempt, change, dialog, duration, failure, h, key, plural, presetWords, size } from "./dom.js";
 import { saving } from "./save.js";
 
 export function run(name, again) {
@@ -131,17 +131,43 @@ const stageOf = (one) => `/stage/${one.key.split("/").map(key).join("/")}/`;
 function frame(one) {
   const address = stageOf(one);
   const element = h("iframe", { class: "result", title: `${one.title}, to relight and turn`, key: `${address} ${one.date}`,
-    sandbox: "allow-scripts allow-same-origin allow-downloads" });
+    sandbox: "allow-scripts allow-downloads allow-forms" });
+  element.address = address;
   element.stays = true;
   const wait = async () => {
-    const response = await fetch(address, { credentials: "same-origin" });
+    const response = await fetch(address, { method: "HEAD", credentials: "same-origin" });
     if (response.status === 202) setTimeout(wait, 800);
     else if (response.ok) element.src = address;
-    else element.replaceWith(h("p", { class: "bad" }, (await response.json().catch(() => ({}))).error || "The result cannot be shown."));
+    else await ask(address).catch((error) => element.replaceWith(h("p", { class: "bad" }, error.message)));
   };
   attempt(wait);
   return element;
 }
+
+const frameOf = (source) => [...document.querySelectorAll("iframe.result")].find((one) => one.contentWindow === source);
+
+/** A result has no origin, so it can ask nothing of the studio: its notes are kept with its run by this page. */
+addEventListener("message", async ({ source, data }) => {
+  const element = frameOf(source);
+  if (!element || typeof data.keep !== "string") return;
+  let kept = "";
+  try {
+    const answer = await fetch(`${element.address}stage.json`, { method: "PUT", body: data.keep, credentials: "same-origin" });
+    if (!answer.ok) kept = (await answer.json().catch(() => ({}))).error || `the studio answered ${answer.status}`;
+  } catch { kept = "the studio does not answer"; }
+  source.postMessage({ kept }, "*");
+});
+
+const KEYS = /^(Arrow\w+|[-+=?lL0-9])$/; // of the stage
+
+/** While a button of this page has the focus, the stage's keys go to the results all the same. */
+addEventListener("keydown", (event) => {
+  const isTaken = event.defaultPrevented || event.altKey || event.ctrlKey || event.metaKey || event.target.closest("input, select, textarea, dialog");
+  const frames = document.querySelectorAll("iframe.result");
+  if (isTaken || !frames.length || !KEYS.test(event.key)) return;
+  event.preventDefault();
+  for (const one of frames) one.contentWindow.postMessage({ press: { key: event.key, shiftKey: event.shiftKey } }, "*");
+});
 
 export function compare(names, again) {
   const view = { pause: 5000, wide: true };
