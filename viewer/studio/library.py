@@ -18,7 +18,7 @@ from viewer.display.run_follower import RunFollower
 from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder
 from viewer.studio.growing import mark_of
-from viewer.studio.page_words import in_page_words
+from viewer.studio.page_words import in_page_words, without_folder
 from viewer.studio.progress import run_progress
 
 PRESETS = ("draft", "standard", "fine", "paper")
@@ -68,8 +68,10 @@ class Library:
             look = looks.get(name, {})
             row = {"name": name, "role": look.get("role", ""), "remarks": look.get("remarks", [])}
             photos.append({**row, "drop": look.get("drop", False), "looked": name in looks})
-        complaints = self._parts.complaints(key)
-        refused = [{"id": part.id, "name": part.name, "why": sentence} for part, sentence in complaints]
+        refused = [
+            {"id": part.id, "name": part.name, "why": in_page_words(without_folder(why, path, "this capture"))}
+            for part, why in self._parts.complaints(key)
+        ]
         return card | {
             "photos": photos,
             "clips": [clip.relative_to(path).as_posix() for clip in clips_of(path)],

@@ -4,7 +4,9 @@ The same sentence serves the terminal, where options are what a person has. Ever
 here. A part that only a terminal can follow and that no rule rewrites is left out: it would be of no use.
 """
 
+import os
 import re
+from pathlib import Path
 
 _AGAIN = "Go on where it stood"  # the button of a run that failed or was stopped
 _RULES = (
@@ -17,6 +19,9 @@ _RULES = (
     (r"and put (the|that) photo into board/", 'and choose "board" below its picture'),
     (r"Put (it|one) into (its folder )?board/", 'Choose "board" below its picture'),
     (r"Put them into its folder light/", 'Choose "light\'s phone" below their pictures'),
+    # photos
+    (r"Remove it from the folder, or copy the photo again", "Copy the photo again"),
+    (r" Remove it from the folder\.", ""),
     # lights
     (r"need a file of lights \(--lights FILE\)", "need a file of lights, dropped with them,"),
     (r"a file of lights \(--lights FILE\.lp\) gives them", "a file of lights, dropped with them, gives them"),
@@ -73,6 +78,11 @@ def in_page_words(text: str) -> str:
     first, *rest = re.split(r"(?<=[.!?]) (?=\S)", text)
     kept = [sentence for sentence in rest if not _OF_TERMINAL.search(sentence)]
     return " ".join([_without_dashes(first), *kept])
+
+
+def without_folder(text: str, folder: Path, called: str = "this folder") -> str:
+    """Return a sentence with the names of files without this folder: where it lies is the studio's machine's alone."""
+    return text.replace(f"{folder}{os.sep}", "").replace(str(folder), called)
 
 
 def document_in_page_words(document: str) -> str:

@@ -6,6 +6,8 @@ users of the machine can reach it. The phones' listener has its own secrets, see
 
 import errno
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from starlette.requests import Request
@@ -16,7 +18,7 @@ from websockets.datastructures import Headers
 from capture.errors import UserError
 from capture.files.atomic import parse_json
 from viewer.page.guard import COOKIE, is_own_page, is_same
-from viewer.studio.page_words import in_page_words
+from viewer.studio.page_words import in_page_words, without_folder
 
 SAFE = ("GET", "HEAD")
 LARGEST_BODY = 1 << 20  # bytes of a request that is no piece of a file
@@ -136,9 +138,14 @@ def text_of(values: dict[str, Any], name: str, most: int = 1000) -> str:
     return value
 
 
-def as_sentence(_request: Request, error: Exception) -> Response:
-    """Return the answer for what the user can mend: one sentence."""
-    status, text = 400, in_page_words(str(error))
+def sentences(root: Path) -> dict[Any, Any]:
+    """Return the handlers of what the user can mend: a sentence each, which does not tell where `root` lies."""
+    handler = partial(_as_sentence, root)
+    return {UserError: handler, OSError: handler}
+
+
+def _as_sentence(root: Path, _request: Request, error: Exception) -> Response:
+    status, text = 400, in_page_words(without_folder(str(error), root))
     if isinstance(error, OSError):
         is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         status = 507 if is_full else 500

@@ -1,7 +1,5 @@
 """What phones that were let in can ask for: the page, sending files to one capture, and how that capture is doing."""
 
-from typing import Any
-
 from anyio import to_thread
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -9,10 +7,10 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from capture.errors import CaptureError, UserError
+from capture.errors import CaptureError
 from viewer.page.guard import COOKIE
 from viewer.studio.studio import Studio
-from viewer.studio_server.gate import Gate, as_sentence, read_object, text_of
+from viewer.studio_server.gate import Gate, read_object, sentences, text_of
 from viewer.studio_server.phones import EVERYWHERE, Door, Phone, Phones
 from viewer.studio_server.uploads import Uploads
 from viewer.studio_server.web_files import file_routes, web_file
@@ -34,7 +32,6 @@ class PhoneRoutes:
     def app(self, phones: Phones) -> ASGIApp:
         """Return the application of the phones' listeners."""
         self._phones = phones
-        handlers: Any = {UserError: as_sentence, OSError: as_sentence}
         routes = [
             *file_routes(FILES, "phone.html"),
             Route("/live", self.live, methods=["GET"]),
@@ -44,7 +41,9 @@ class PhoneRoutes:
             Route("/api/leave", self.leave, methods=["POST"]),
             *Uploads(self._studio.parts, self._target, lambda request: self._mine(request).name).routes(),
         ]
-        return Gate(Starlette(routes=routes, exception_handlers=handlers), EVERYWHERE, self._admits)
+        return Gate(
+            Starlette(routes=routes, exception_handlers=sentences(self._studio.folder.root)), EVERYWHERE, self._admits
+        )
 
     async def live(self, _request: Request) -> Response:
         """The same page; its address tells it to show the live camera."""
@@ -80,12 +79,12 @@ class PhoneRoutes:
             return PlainTextResponse("Phones are not let in at the moment.\n", 403)
         if request.url.path in FREE or self._phones.find(request.cookies.get(COOKIE_NAME, "")) is not None:
             return None
-        return JSONResponse({"error": "This phone is not in. Scan the code that the studio shows now."}, 401)
+        return JSONResponse({"error": "This phone is not in. Scan the new code that the studio shows."}, 401)
 
     def _mine(self, request: Request) -> Phone:
         phone = self._phones.find(request.cookies.get(COOKIE_NAME, ""))
         if phone is None:
-            raise CaptureError("This phone is not in any more. Scan the code that the studio shows now.")
+            raise CaptureError("This phone is not in any more. Scan the new code that the studio shows.")
         return phone
 
     def _door(self) -> Door:

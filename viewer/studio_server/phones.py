@@ -118,7 +118,7 @@ class Phones:
         with self._lock:
             door = self.door
             if door is None or not secrets.compare_digest(token.encode(), door.token.encode()):
-                raise CaptureError("This code was used, or is over. Scan the one that the studio shows now.")
+                raise CaptureError("This code was used already, or is over. Scan the new code that the studio shows.")
             if len(door.phones) >= MOST_PHONES:
                 raise CaptureError(f"{MOST_PHONES} phones are in already. Turn the switch off and on to start anew.")
             shown = "".join(letter for letter in name if letter.isprintable())[:LONGEST_NAME] or "a phone"

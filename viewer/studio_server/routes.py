@@ -12,14 +12,14 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from capture.errors import CaptureError, UserError
+from capture.errors import CaptureError
 from capture.files.regular import is_regular, read_regular
 from viewer.stage.files import HEADERS
 from viewer.stage.page import page_policy
 from viewer.studio import boards
 from viewer.studio.page_words import document_in_page_words
 from viewer.studio.studio import Studio
-from viewer.studio_server.gate import FRAMED_POLICY, as_sentence, read_body, read_object, text_of
+from viewer.studio_server.gate import FRAMED_POLICY, read_body, read_object, sentences, text_of
 from viewer.studio_server.phones import Phones
 from viewer.studio_server.uploads import Uploads
 from viewer.studio_server.web_files import file_routes
@@ -39,7 +39,6 @@ KEPT = {"Cache-Control": "private, max-age=86400"}
 
 def owner_app(studio: Studio, phones: Phones) -> Starlette:
     """Return the application of the owner's page, without its gate."""
-    handlers: Any = {UserError: as_sentence, OSError: as_sentence}
     routes = [
         *file_routes(OWNER_FILES, "index.html"),
         *_questions(studio, phones),
@@ -48,7 +47,7 @@ def owner_app(studio: Studio, phones: Phones) -> Starlette:
             studio.parts, lambda _, key: studio.folder.key(studio.folder.capture(key)), lambda _: "owner"
         ).routes(),
     ]
-    return Starlette(routes=routes, exception_handlers=handlers)
+    return Starlette(routes=routes, exception_handlers=sentences(studio.folder.root))
 
 
 def _questions(studio: Studio, phones: Phones) -> list[Route]:

@@ -2,7 +2,7 @@
 
 import { h, plural } from "./dom.js";
 import { dome } from "./hemisphere.js";
-import { picked, sending } from "./upload.js";
+import { complaint, picked, sending } from "./upload.js";
 import { voice } from "./voice.js";
 
 /** The view of one phone; `phone` is what all views share: its state, its sender, and how to draw again. */
@@ -27,7 +27,7 @@ export function album(phone) {
       h("section", { class: "panel", "aria-live": "polite" },
         h("p", {}, `${plural(state.count, "photo")} in the capture${state.lit ? `, ${state.lit} under the flashlight` : ""}.`),
         state.bad.length > 0 && h("p", { class: "warn" }, "Take again: ", state.bad.slice(-5).map((one) => `${one.name} (${one.remarks[0][0]})`).join(", ")),
-        state.refused.length > 0 && h("p", { class: "bad" }, state.refused.slice(-3).map((one) => `${one.name}: ${one.why}`).join(" ")),
+        state.refused.length > 0 && h("p", { class: "bad" }, state.refused.slice(-3).map((one) => complaint(one.name, one.why)).join(" ")),
         check.sentence && h("p", { class: `verdict ${check.verdict}` }, check.sentence),
         !check.sentence && check.error && h("p", { class: "bad" }, check.error),
         check.advice.length > 0 && h("ul", { class: "plain" }, check.advice.map((text) => h("li", {}, text))),

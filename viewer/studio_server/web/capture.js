@@ -4,7 +4,7 @@ import { PRESETS, about, ask as question, attempt, bytes, change, day, dialog, d
 import { boardOnScreen, printLink } from "./board.js";
 import { dome } from "./hemisphere.js";
 import { phones } from "./phones.js";
-import { Sender, dropped, picked, sending } from "./upload.js";
+import { Sender, complaint, dropped, picked, sending } from "./upload.js";
 import { voice } from "./voice.js";
 
 const ROLES = { "": "as it looks", board: "board", lit: "flashlight", light: "light's phone", dark: "light off", side: "side photo" };
@@ -53,7 +53,7 @@ export function capture(name, again) {
         h("div", { class: "bar" }, chooser("Choose files", {}), chooser("Choose a folder", { webkitdirectory: true }), phone.button())),
       phone.panel(), sending(sender), row.stalled > 0 && stalled(row),
       row.refused.length > 0 && h("div", { class: "bad small" }, h("p", {}, "Not taken:"),
-        h("ul", { class: "plain" }, row.refused.slice(-5).map((one) => h("li", {}, `${one.name.split("/").pop()}: ${one.why} `,
+        h("ul", { class: "plain" }, row.refused.slice(-5).map((one) => h("li", {}, complaint(one.name, one.why), " ",
           h("button", { onclick: () => attempt(async () => { await change("dismiss", { key: row.key, part: one.id }); again(); }) }, "Dismiss"))))),
       row.photos.length + row.clips.length > 0 && h("p", { class: "quiet" }, counts(row)),
       bad.length > 0 && h("p", { class: "warn" }, `Take again: ${bad.slice(0, 4).map((photo) => `${photo.name} (${photo.remarks[0][0]})`).join(", ")}`),

@@ -77,10 +77,10 @@ export async function change(name, values = {}) {
 }
 
 async function answered(response) {
-  if (response.status === 401) throw new Error("This page has no access any more. Open the address that shadowgraph printed.");
   const found = await response.json().catch(() => ({}));
-  if (!response.ok) throw new Error(found.error || `The studio answered ${response.status}.`);
-  return found;
+  if (response.ok) return found;
+  const closed = "This page has no access any more. Open the address that shadowgraph printed.";
+  throw new Error(found.error || (response.status === 401 ? closed : `The studio answered ${response.status}.`));
 }
 
 /** Do something that may fail; what is wrong becomes a sentence on the page. */

@@ -8,6 +8,7 @@ import { Sender } from "./upload.js";
 const main = document.getElementById("main");
 const phone = { state: null, problem: "", draw };
 phone.sender = new Sender("", draw);
+let refused = ""; // why the code did not let this phone in
 const view = (location.pathname === "/live" ? live : album)(phone);
 
 /** Show the code's secret once; the phone has a cookie from then on. */
@@ -36,10 +37,10 @@ function page() {
 async function refresh() {
   try {
     phone.state = await ask("/api/state");
-    phone.problem = "";
+    phone.problem = refused = "";
     view.heard(phone.state);
   } catch (error) {
-    phone.problem = error instanceof TypeError ? "The studio does not answer. This page waits for it." : error.message;
+    phone.problem = error instanceof TypeError ? "The studio does not answer. This page waits for it." : refused || error.message;
     if (!(error instanceof TypeError)) phone.state = null;
   }
   draw();
@@ -47,5 +48,5 @@ async function refresh() {
 }
 
 document.title = view.title;
-try { await join(); } catch (error) { phone.problem = error.message; draw(); }
+try { await join(); } catch (error) { refused = error.message; }
 refresh();

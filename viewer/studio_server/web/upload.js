@@ -25,6 +25,7 @@ export class Sender {
 
   get open() { return this.files.filter((one) => !one.done && !one.failed); }
   get failed() { return this.files.filter((one) => one.failed); }
+  get stuck() { return this.failed.filter((one) => !one.isFinal); }
   get total() { return this.files.reduce((sum, one) => sum + one.file.size, 0); }
   get sent() { return this.files.reduce((sum, one) => sum + (one.done ? one.file.size : one.sent), 0); }
 
@@ -34,7 +35,7 @@ export class Sender {
       if (!next) break;
       next.busy = true;
       this.active += 1;
-      send(next, this.capture, this.changed).catch((error) => { next.failed = error.message; }).finally(() => {
+      send(next, this.capture, this.changed).catch((error) => { Object.assign(next, { failed: error.message, isFinal: Boolean(error.isFinal) }); }).finally(() => {
         next.busy = false;
         this.active -= 1;
         this.changed();
@@ -45,8 +46,13 @@ export class Sender {
   }
 
   again() {
-    for (const one of this.failed) { one.failed = ""; one.address = ""; one.sent = 0; }
+    for (const one of this.stuck) { one.failed = ""; one.address = ""; one.sent = 0; }
     this.work();
+  }
+
+  dismiss() {
+    this.files = this.files.filter((one) => !one.failed);
+    this.changed();
   }
 }
 
@@ -67,7 +73,7 @@ async function send(one, capture, changed) {
       one.done = true;
       return;
     } catch (error) {
-      if (error instanceof Refused) throw error;
+      if (error instanceof Refused) throw error; // sending the same again would end the same
       if (Date.now() - last > PATIENCE_MS) throw new Error("the studio could not be reached for half an hour");
       await new Promise((resolve) => setTimeout(resolve, pause));
       pause = Math.min(2 * pause, 8000);
@@ -75,7 +81,9 @@ async function send(one, capture, changed) {
   }
 }
 
-class Refused extends Error {}
+class Refused extends Error {
+  constructor(words, isFinal) { super(words); this.isFinal = isFinal; }
+}
 
 const base64 = (text) => btoa(String.fromCharCode(...new TextEncoder().encode(text)));
 
@@ -101,8 +109,7 @@ async function piece(one) {
   const response = await fetch(one.address, { method: "PATCH", headers, body, credentials: "same-origin" });
   if (response.status === 409) return Number(response.headers.get("Upload-Offset"));
   await refuse(response);
-  const why = response.headers.get("Shadowgraph-Refused");
-  if (why) throw new Refused(new TextDecoder().decode(Uint8Array.from(atob(why), (letter) => letter.charCodeAt(0))));
+  one.isListed = response.headers.has("Shadowgraph-Refused"); // the studio says why, in the list of its page
   return Number(response.headers.get("Upload-Offset"));
 }
 
@@ -111,8 +118,8 @@ async function refuse(response) {
   const found = await response.json().catch(() => ({}));
   if ([400, 401, 403, 507].includes(response.status) && (found.error || response.status !== 400)) {
     const full = "the studio's disk is full: make room there, and send it again";  // the answer to HEAD has no text
-    const closed = "this page has no access any more; scan the code again, or open the printed address";
-    throw new Refused(found.error || (response.status === 507 ? full : closed));
+    const closed = "this page has no access any more; scan the new code, or open the printed address";
+    throw new Refused(found.error || (response.status === 507 ? full : closed), response.status === 400);
   }
   throw new Error(`answer ${response.status}`);
 }
@@ -150,12 +157,20 @@ export function picked(input) {
 /** A bar for what is on its way, and what was not taken. */
 export function sending(sender) {
   if (!sender.files.length) return null;
-  const share = sender.total ? sender.sent / sender.total : 1;
-  const done = sender.files.filter((one) => one.done).length;
+  const share = sender.total ? sender.sent / sender.total : 1, files = sender.files.filter((one) => !one.isListed && !one.isFinal);
+  const done = files.filter((one) => one.done).length;
   return h("div", { "aria-live": "polite" },
     sender.open.length > 0 && h("progress", { max: "1", value: share, "aria-label": "Files on their way" }),
-    h("p", {}, `${done} of ${sender.files.length} files are here${sender.open.length ? `, ${Math.round(100 * share)} %` : "."}`),
-    sender.failed.length > 0 && h("div", { class: "bad" }, h("p", {}, `${sender.failed.length} were not taken:`),
-      h("ul", { class: "plain small" }, sender.failed.slice(0, 6).map((one) => h("li", {}, `${one.path}: ${one.failed}`))),
-      h("button", { onclick: () => sender.again() }, "Try again")));
+    files.length > 0 && h("p", {}, `${done} of ${files.length} files are here${sender.open.length ? `, ${Math.round(100 * share)} %` : "."}`),
+    sender.failed.length > 0 && h("div", { class: "bad small" }, h("p", {}, "Not taken:"),
+      h("ul", { class: "plain" }, sender.failed.slice(0, 6).map((one) => h("li", {}, complaint(one.path, one.failed)))),
+      sender.failed.length > 6 && h("p", {}, `and ${sender.failed.length - 6} more.`),
+      h("div", { class: "bar" }, sender.stuck.length > 0 && h("button", { onclick: () => sender.again() }, "Try again"),
+        h("button", { onclick: () => sender.dismiss() }, "Dismiss"))));
+}
+
+/** What is wrong with a file, which is named once. */
+export function complaint(path, why) {
+  const name = path.split("/").pop();
+  return why.startsWith(name) ? why : `${name}: ${why}`;
 }

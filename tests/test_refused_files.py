@@ -1,0 +1,112 @@
+"""A file that is not taken is said once, in words that say what to do, and the sentence can be dismissed."""
+
+import io
+import zipfile
+
+import pytest
+from chromium import CHROMIUM
+from studio_client import served
+from test_intake import jpeg
+from test_studio import capture_in
+from test_studio_browser import DESKTOP, PHONE, browser, opened  # noqa: F401  a fixture
+
+from viewer.studio.page_words import in_page_words
+
+
+def a_zip(**files: bytes) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name.replace("_", "."), content)
+    return file.getvalue()
+
+
+REFUSED = {  # name, content, role
+    "text under a photo's name": ("IMG_7.jpg", b"no photo", ""),
+    "an empty photo's name": ("set/photos/IMG_8.png", b"<html>", ""),
+    "an archive of texts": ("set.zip", a_zip(notes_txt=b"x", more_md=b"y"), ""),
+    "an archive with a photo that is none": ("two.zip", a_zip(IMG_jpg=b"x" * 99), ""),
+    "no archive": ("three.zip", b"PK nothing", ""),
+    "a role where the settings are damaged": ("IMG_9.jpg", jpeg(9), "board"),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_a_refused_file_is_said_without_the_servers_path_or_a_folder_that_the_sender_does_not_have(tmp_path, kind):
+    name, content, role = REFUSED[kind]
+    capture_in(tmp_path, "vase")
+    capture = tmp_path / "vase"
+    if role:
+        (capture / "photos").rename(capture / "loose")
+        (capture / "loose" / "IMG_0.jpg").rename(capture / "IMG_0.jpg")
+        (capture / "session.toml").write_text("board = ")
+    with served(tmp_path) as (_, _, owner):
+        owner.send("vase", name, content, role)
+        refused = owner.get("/api/capture?key=vase")[1]["refused"]
+    assert refused
+    for one in refused:
+        assert str(tmp_path) not in one["why"] and "from the folder" not in one["why"], one["why"]
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "a.jpg holds nothing; JPEG is needed. Remove it from the folder, or copy the photo again.",
+        "a.jpg is a folder or a device, a photo's file is needed. Remove it from the folder.",
+        "a.jpg, reduced, is 3 x 4; 9 each way are needed to recognise its content. Remove it from the folder.",
+    ],
+)
+def test_no_sentence_of_the_page_speaks_of_a_folder_to_remove_a_photo_from(said):
+    assert "from the folder" not in in_page_words(said) and in_page_words(said).endswith(".")
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_each_refused_file_is_named_once_and_dismissed_without_an_offer_to_try_again(browser, tmp_path, size):  # noqa: F811
+    photos = tmp_path / "drop"
+    photos.mkdir()
+    for name, content in {"notes.txt": b"x", "IMG_1.jpg": b"no photo", "list.md": b"y", "IMG_2.jpg": jpeg(2)}.items():
+        (photos / name).write_bytes(content)
+    with served(tmp_path / "studio") as (_, _, owner):
+        key = owner.ok("new", title="vase")
+        tab, _ = opened(browser, owner, size)
+        tab.goto(f"http://127.0.0.1:{owner.port}/#/capture/{key.replace('/', '%2F')}")
+        with tab.expect_file_chooser() as chooser:
+            tab.click("text=Choose files")
+        chooser.value.set_files([str(path) for path in photos.iterdir()])
+        tab.wait_for_selector("text=1 of 1 files are here.")
+        tab.wait_for_selector("li:has-text('IMG_1.jpg')")
+        page = tab.inner_text("main")
+        assert all(page.count(name) == 1 for name in ("notes.txt", "IMG_1.jpg", "list.md")), page
+        assert "Try again" not in page and "folder." not in page and str(tmp_path) not in page
+        tab.click(".bar > button:has-text('Dismiss')")
+        tab.click("li button:has-text('Dismiss')")
+        tab.wait_for_selector("text=Not taken", state="detached")
+        page = tab.inner_text("main")
+        assert "Not taken" not in page and "IMG_2.jpg" in page
+        tab.reload()
+        tab.wait_for_selector("text=IMG_2.jpg")
+        assert "Not taken" not in tab.inner_text("main")
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_a_used_code_says_to_scan_the_new_one_and_so_does_a_page_that_was_loaded_anew(browser, tmp_path):  # noqa: F811
+    capture_in(tmp_path, "vase")
+    with served(tmp_path) as (_, phones, owner):
+        owner.ok("let_in", key="vase")
+        address = phones.row()["address"]
+        first, second = (browser.new_context(viewport=PHONE).new_page() for _ in range(2))
+        first.goto(address)
+        first.wait_for_selector("text=Choose photos")
+        second.goto(address)
+        for _ in range(2):
+            second.wait_for_selector("text=Scan the new code")
+            second.wait_for_timeout(1800)  # the page asks again meanwhile
+            assert "Scan the new code" in second.inner_text("main") and "token" not in second.inner_text("main")
+            second.reload()
+        first.goto("about:blank")
+        first.goto(address)  # a phone that is in scans its old code again
+        first.wait_for_selector("text=Choose photos")
+        owner.ok("send_away")
