@@ -25,7 +25,7 @@ from reconstruct.evaluate.score import Reference
 from reconstruct.evaluate.surface_distance import angle_deg
 from reconstruct.fields import Fields
 from reconstruct.labels.observer import Observer
-from reconstruct.run.machine import rays_per_second
+from reconstruct.run.machine import measure_speed
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.config import ShadowSamples, TrainConfig, Weights, shortened_training
@@ -165,7 +165,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2, help="iterations measured at the paper's batch; 0: none")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    rays_per_second()  # compiles the kernels
+    measure_speed()  # compiles the kernels
     torch.set_num_threads(1)  # small batches only make a second thread wait, which counts as CPU time
     subject = open_subject(options.subject, options.input)
     full, small = (scene_of(subject, subject.calibration, side) for side in (10_000, MINIATURE_PIXELS))

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from reconstruct.run_folder.folder import Progress as Step
+from reconstruct.run_folder.forecast import STAGE_NAMES, Forecast, left_text
 
 PAGE_WAIT_S = 20.0  # for the viewer to send its address: it imports torch, which takes seconds on a busy machine
 LINE_EVERY_S = 4.0  # between progress lines where no bar can be drawn: nobody looks at a still screen for over 5 s
@@ -22,7 +24,8 @@ LOOK_EVERY_S = 0.25  # whether a line is due
 
 
 class Display:
-    """Shows progress: stage, n of m, time left. In a terminal it draws a bar, elsewhere it prints lines.
+    """Shows progress: how far the whole is, the time left, and what is done now. In a terminal it draws one bar,
+    elsewhere it prints lines.
 
     Where it prints lines and a step takes long, `beat` says for how long, and at what. This is for the eye alone: the
     run's log does not have it.
@@ -30,41 +33,40 @@ class Display:
 
     def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic):
         """Draw on this console; `clock` tells seconds."""
-        columns = (TextColumn("{task.description:<10}"), BarColumn(24), TextColumn("{task.fields[words]}"))
+        columns = (TextColumn("{task.description}"), BarColumn(24), TextColumn("{task.fields[words]}"))
         self.console = console
         self.progress = Progress(*columns, TimeElapsedColumn(), console=console, disable=not console.is_terminal)
         self._task: TaskID | None = None
         self._clock, self._one_at_a_time = clock, threading.Lock()
-        self._stage, self._doing = "", ""  # what is being done; "" while the run waits
-        self._since = self._last = clock()  # since when, and when a line was printed
+        self._forecast, self._step = Forecast(), Step(0.0, 0.0, "")
+        self._doing = ""  # what is being done; "" while the run waits
+        self._since = self._last = self._stepped = clock()  # since when, when a line was printed, when a step was done
 
     def __call__(self, step: Step) -> None:
         """Show one step."""
-        is_new = step.stage != self._stage
-        counts = f"{step.done:g} of {step.total:g}" if step.total > 1 else ""
-        eta = "" if step.eta_s is None or step.done >= step.total else f"{step.eta_s:.0f} s left"
-        words = ", ".join(part for part in (counts, eta, step.message) if part)
         with self._one_at_a_time:
-            self._stage, self._doing, self._since = step.stage, words, self._clock()
-            if self.progress.disable:
-                if is_new or not step.numbers or self._since - self._last >= LINE_EVERY_S:
-                    self._print(words)
-                return
-            if self._task is None or is_new:
-                self._task = self.progress.add_task(step.stage, words=words, total=step.total or None)
-            self.progress.update(self._task, completed=step.done, total=step.total or None, words=words)
+            is_new = step.stage != self._step.stage
+            self._forecast.see(asdict(step))
+            self._step, self._doing = step, step.message
+            self._since = self._stepped = self._clock()
+            if not self.progress.disable:
+                self._draw()
+            elif is_new or not step.numbers or self._since - self._last >= LINE_EVERY_S:
+                self._print(self._doing)
 
     def activity(self, sentence: str) -> None:
         """Show what is done until the next step; an empty sentence: the run waits, and nothing is to be said."""
         with self._one_at_a_time:
             self._doing, self._since = sentence, self._clock()
-            if self._task is not None and sentence:
-                self.progress.update(self._task, words=sentence)
+            self._draw()
 
     def beat(self) -> None:
-        """Print what is being done, and for how long, if no line was printed for LINE_EVERY_S."""
+        """Move the bar on; elsewhere print what is being done, and for how long, after LINE_EVERY_S without a line."""
         with self._one_at_a_time:
             now = self._clock()
+            if self._doing:
+                self._forecast.at(self._step.t + now - self._stepped)
+                self._draw()
             if self.progress.disable and self._doing and now - self._last >= LINE_EVERY_S:
                 seconds = now - self._since
                 self._print(f"{self._doing}, {seconds:.0f} s so far" if seconds >= 1 else self._doing)
@@ -83,10 +85,35 @@ class Display:
             ended.set()
             thread.join()
 
-    def _print(self, words: str) -> None:
+    def _where(self) -> tuple[str, float, str]:
+        """Return what is done in plain words, the share done, and how far that is in words.
+
+        Of a run all of it; of other commands, which have one stage and plan no time, the steps and seconds of that.
+        """
+        step, stage = self._step, self._forecast.stage
+        if self._forecast.left_s is not None:
+            share, left = self._forecast.share, self._forecast.left_s
+            words = "" if stage == "done" else f"{share:.0%}, {left_text(left)}"
+        else:
+            share = step.done / step.total if step.total else 0.0
+            counts = f"{step.done:g} of {step.total:g}" if step.total > 1 else ""
+            words = ", ".join(filter(None, (counts, "" if share >= 1 else left_text(step.eta_s))))
+        return STAGE_NAMES.get(stage, stage), share, words
+
+    def _draw(self) -> None:
+        name, share, words = self._where()
+        if self.progress.disable or not name:
+            return
+        if self._task is None:
+            self._task = self.progress.add_task(name, words=words, total=1.0)
+        words = ", ".join(filter(None, (words, self._doing)))
+        self.progress.update(self._task, description=name, completed=share, words=words)
+
+    def _print(self, doing: str) -> None:
         self._last = self._clock()
-        text = f"{self._stage}: {words}" if self._stage else words
-        print_lines(self.console, text)
+        name, _, words = self._where()
+        text = ", ".join(filter(None, (words, doing)))
+        print_lines(self.console, ": ".join(filter(None, (name, text))))
 
 
 def _call_until(beat: Callable[[], None], ended: threading.Event) -> None:

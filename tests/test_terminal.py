@@ -38,9 +38,9 @@ def test_a_long_step_says_what_it_does_and_for_how_long():
     screen.display(step(0, "carving"))
     screen.wait(9)
     assert screen.lines() == [
-        "solve: 0 of 60, carving",
-        "solve: 0 of 60, carving, 4 s so far",
-        "solve: 0 of 60, carving, 8 s so far",
+        "Carving the first shape: 0 of 60, carving",
+        "Carving the first shape: 0 of 60, carving, 4 s so far",
+        "Carving the first shape: 0 of 60, carving, 8 s so far",
     ]
 
 
@@ -68,7 +68,7 @@ def test_a_run_that_waits_for_a_visitor_is_silent():
     screen.display(step(5, "paused"))
     screen.display.activity("")
     screen.wait(60)
-    assert screen.lines() == ["solve: 5 of 60, paused"]
+    assert screen.lines() == ["Fitting the surface: 5 of 60, paused"]
 
 
 def test_a_run_says_soon_what_it_opens_and_a_quick_refusal_stands_alone():

@@ -1,41 +1,74 @@
-"""Measure this machine's speed with a short loop of shadow rays, and predict from it how long a run takes."""
+"""Measure this machine's speed with a short loop of shadow rays, and plan from it how long each part of a run takes."""
 
 import importlib.util
 import os
 import platform
 import shutil
 import time
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import psutil
 import torch
 
+from capture.decode.formats import read_size
 from capture.decode.sandbox import confinement
+from capture.errors import UserError
 from reconstruct.run.presets import preset, shortened
 from reconstruct.run_folder.cost import memory_room
+from reconstruct.run_folder.forecast import duration_text
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import thread_count, visibility
 from reconstruct.solve.backend import backend_name, solver_device
 from reconstruct.solve.solver import FitConfig
 from reconstruct.source.memory import predicted_memory
+from reconstruct.source.options import LONG_SIDES, RunOptions
+from reconstruct.source.source import Source
 
-LOOP_S = 1.0  # of measuring: the rate then repeats within some 10 % on an idle machine
+LOOP_S = 0.5  # of measuring: the rate then repeats within some 10 % on an idle machine
 LOOP_NODES, LOOP_RAYS = 64, 20_000  # a ball in a grid like the solver's second one
 SHARPNESS = 10.0  # NeuS s per voxel, the middle of the solver's range
 # What one iteration costs, in rays of this loop: per ray, and per squared number of nodes, for only those near the
 # surface are kept. Levels of 96, 160 and 320 nodes took 0.09, 0.15 and 0.41 CPU s, a ray of the loop 0.63 microseconds.
 COST_PER_RAY, COST_PER_NODE = 2.0, 5.5
-OTHER_SHARE = 1.5  # of the iterations' time: labels, photos, lights, mesh and report of some 36 photos, by the same run
+# What the other stages cost, in CPU seconds where a ray of the loop takes USUAL_RAY_S: examples/spot, 36 photos of 0.8
+# megapixels, draft and standard. A photo of 12 megapixels takes .12 s more to decode.
+USUAL_RAY_S = 0.63e-6
+READING_S, DECODING_S, LIGHT_S, JUDGING_S = 0.09, 0.01, 0.15, 0.02  # a photo; decoding: and a megapixel
+HULL_S, LABELS_S = 3.5, 0.5e-6  # of a run; a pixel of the solver's pictures, and a photo
+MESH_S, DETAIL_S, REPORT_S = 4e-5, 0.03, 1.5  # a squared node; a photo and a megapixel; of a run
+COMPILING_S = 18.0  # of the first run on a machine
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 OPTIONAL = {"playwright": "browser tests"}
 GIB = 2**30
 FEWEST_SHARE = 0.25
+SIDES_RATIO = 0.75  # of a photo's sides
+CLIP_MEGAPIXELS = 2.0  # of a frame, 1920 x 1080
 
 
-def rays_per_second() -> float:
-    """Measure shadow rays per second through a ball on a small grid, on all cores, after a warm-up of the kernel."""
+class Speed(NamedTuple):
+    """What this machine takes for one shadow ray on all its cores: CPU seconds, and seconds of the clock."""
+
+    cpu_s: float
+    clock_s: float
+
+    def seconds(self, cpu_s: float, is_shared: bool) -> float:
+        """Return the seconds of the clock that work takes here.
+
+        Args:
+            cpu_s: what it takes where a ray takes USUAL_RAY_S.
+            is_shared: it runs on all cores; else on one, which other programs slow down as they do here.
+        """
+        at_a_time = self.clock_s / self.cpu_s
+        return cpu_s * self.cpu_s / USUAL_RAY_S * (at_a_time if is_shared else max(at_a_time, 1.0))
+
+
+def measure_speed() -> Speed:
+    """Measure shadow rays through a ball on a small grid, on all cores, after a warm-up of the kernel."""
     axis = torch.linspace(-1.5, 1.5, LOOP_NODES)
     nodes = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
     spacing = float(axis[1] - axis[0])
@@ -44,29 +77,76 @@ def rays_per_second() -> float:
     points = torch.stack([1.3 * turn.cos(), 1.3 * turn.sin(), -0.9 + 0.2 * turn], -1)
     lights = torch.tensor([3.0, 1.0, 4.0, 1.0]).expand(LOOP_RAYS, 4).contiguous()
     visibility(grid, points[:100], lights[:100], SHARPNESS / spacing)
-    start, done = time.perf_counter(), 0
+    start, cpu_start, done = time.perf_counter(), time.process_time(), 0
     while time.perf_counter() - start < LOOP_S:
         visibility(grid, points, lights, SHARPNESS / spacing)
         done += LOOP_RAYS
-    return done / (time.perf_counter() - start)
+    clock = (time.perf_counter() - start) / done
+    return Speed(max(time.process_time() - cpu_start, 1e-3) / done, clock)
 
 
-def solve_seconds(config: FitConfig, rate: float) -> float:
-    """Estimate the wall-clock time (s) of a schedule's iterations at `rate` rays per second."""
-    work = [level.iterations * (COST_PER_RAY * config.rays + COST_PER_NODE * level.nodes**2) for level in config.levels]
-    return sum(work) / rate
+class Work(NamedTuple):
+    """What a run has to look at: photos of so many megapixels, and their longer side (px) as the solver sees them."""
+
+    photos: int
+    megapixels: float
+    long_side: int
+    has_detail: bool = False
 
 
-def within_budget(config: FitConfig, seconds: float) -> FitConfig:
+def work_of(source: Source, options: RunOptions, has_detail: bool = False) -> Work:
+    """Return what a run has to look at."""
+    photos = source.photos()
+    with suppress(UserError, OSError):  # a clip's frames have no header
+        width, height = read_size(photos[0])
+        return Work(len(photos), width * height / 1e6, LONG_SIDES[options.preset], has_detail)
+    return Work(len(photos), CLIP_MEGAPIXELS, LONG_SIDES[options.preset], has_detail)
+
+
+def planned_seconds(config: FitConfig, speed: Speed, work: Work) -> dict[str, float | dict[int, float]]:
+    """Return the seconds that each stage of a run will take here; of `solve`, up to the last step of each level."""
+    solve, steps, rays = {}, 0, 0.0
+    for level in config.levels:
+        steps += level.iterations
+        rays += level.iterations * (COST_PER_RAY * config.rays + COST_PER_NODE * level.nodes**2)
+        solve[steps] = speed.seconds(rays * USUAL_RAY_S, True)
+    compiling = 0.0 if kernels_are_compiled() else COMPILING_S
+    hull = HULL_S + LABELS_S * work.photos * work.long_side**2 * SIDES_RATIO + compiling
+    plan: dict[str, float | dict[int, float]] = {
+        "capture": speed.seconds(work.photos * (READING_S + DECODING_S * work.megapixels), False),
+        "calibrate": speed.seconds(work.photos * LIGHT_S, False),
+        "check": speed.seconds(work.photos * JUDGING_S, False),
+        "hull": speed.seconds(hull, True),
+        "solve": solve,
+        "mesh": speed.seconds(MESH_S * config.levels[-1].nodes ** 2, False),
+        "report": speed.seconds(REPORT_S, False),
+    }
+    if work.has_detail:
+        plan["detail"] = speed.seconds(work.photos * work.megapixels * DETAIL_S, False)
+    return plan
+
+
+def whole_seconds(plan: Mapping[str, float | Mapping[int, float]]) -> float:
+    """Return the seconds of all stages together."""
+    return sum(max(one.values()) if isinstance(one, Mapping) else one for one in plan.values())
+
+
+def within_budget(config: FitConfig, seconds: float, work: Work) -> FitConfig:
     """Return the schedule, shortened where needed to fit into about so many seconds on this machine.
 
     With less than a quarter of its iterations a level brings nothing, so the finest level is dropped first.
     """
-    rate = rays_per_second()
+    speed = measure_speed()
     while True:
-        share = seconds / (OTHER_SHARE * solve_seconds(config, rate))
+        plan = planned_seconds(config, speed, work)
+        steps = plan["solve"]
+        assert isinstance(steps, dict)
+        solving = max(steps.values())
+        share = (seconds - whole_seconds(plan) + solving) / solving
+        if share >= 1:
+            return config
         if share >= FEWEST_SHARE or len(config.levels) == 1:
-            return config if share >= 1 else shortened(config, share)
+            return shortened(config, max(share, 0.0))
         config = replace(config, levels=config.levels[:-1])
 
 
@@ -76,12 +156,13 @@ def predicted_runs(photos: int, width: int, height: int) -> list[dict[str, str |
     Args:
         photos: their number, of width x height px.
     """
-    rate, room = rays_per_second(), memory_room()
+    speed, room = measure_speed(), memory_room()
     found: list[dict[str, str | float | bool]] = []
     for name in ("draft", "standard", "fine"):
         needed = predicted_memory(photos, width, height, name)
-        seconds = OTHER_SHARE * solve_seconds(preset(name, 0)[1], rate)
-        found.append({"name": name, "seconds": seconds, "bytes": float(needed), "fits": needed <= room})
+        side, config = preset(name, 0)
+        plan = planned_seconds(config, speed, Work(photos, width * height / 1e6, side, name == "fine"))
+        found.append({"name": name, "seconds": whole_seconds(plan), "bytes": float(needed), "fits": needed <= room})
     return found
 
 
@@ -92,27 +173,21 @@ def describe_machine() -> list[str]:
         f"Python {platform.python_version()} on {platform.platform()}",
         f"cores: {os.cpu_count()}, used: {thread_count()}",
         f"memory: {memory.total / GIB:.1f} GiB, free {memory.available / GIB:.1f} GiB",
-        f"memory of a run of 36 photos of 12 megapixels: {_memory_of_presets()}",
         f"photos are decoded: {confinement()}",
         f"torch {torch.__version__}: {_accelerator()}",
-        f"the surface is fitted by: {backend_name(solver_device('auto'))}",
-        f"numba kernels: {_cache_state()}",
+        f"the surface is fitted on: {backend_name(solver_device('auto'))}",
+        f"compiled parts: {_cache_state()}",
         f"browser for the tests: {next(filter(shutil.which, BROWSERS), 'none found; those tests are skipped')}",
     ]
     for module, use in OPTIONAL.items():
         has = importlib.util.find_spec(module) is not None
         lines.append(f"{module} ({use}): {'installed' if has else 'not installed, optional'}")
-    rate = rays_per_second()
-    lines.append(f"speed: {rate / 1e6:.2f} million shadow rays per second")
-    seconds = {name: OTHER_SHARE * solve_seconds(preset(name, 0)[1], rate) for name in ("draft", "standard", "fine")}
-    times = ", ".join(f"{name} {value:.0f} s" for name, value in seconds.items())
-    lines.append(f"a run of 36 photos will take about: {times} (if nothing else runs)")
+    for row in predicted_runs(36, 4032, 3024):
+        seconds, memory = duration_text(float(row["seconds"])), f"{float(row['bytes']) / GIB:.1f} GiB of memory"
+        lines.append(
+            f"36 photos of 12 megapixels, --preset {row['name']}: about {seconds} as busy as it is now, {memory}"
+        )
     return lines
-
-
-def _memory_of_presets() -> str:
-    needs = {name: predicted_memory(36, 4032, 3024, name) / GIB for name in ("draft", "standard", "fine")}
-    return ", ".join(f"{name} {value:.1f} GiB" for name, value in needs.items())
 
 
 def _accelerator() -> str:
@@ -133,5 +208,5 @@ def _cache_folder() -> Path:
 
 def _cache_state() -> str:
     if kernels_are_compiled():
-        return f"compiled and kept in {_cache_folder()}"
-    return f"not compiled yet; the first run compiles them ({_cache_folder()})"
+        return f"kept in {_cache_folder()}"
+    return f"none yet; the first run compiles them and takes some 20 s longer ({_cache_folder()})"

@@ -32,11 +32,13 @@ from reconstruct.fields import Fields, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.run.ball_on_ground import without_ball
 from reconstruct.run.detail_stage import detail_is_asked, write_detail
-from reconstruct.run.machine import kernels_are_compiled
+from reconstruct.run.machine import kernels_are_compiled, measure_speed, planned_seconds, whole_seconds, work_of
+from reconstruct.run.presets import solver_config
 from reconstruct.run.report_json import summary, versions
 from reconstruct.run.results import save_results, save_views_maps
 from reconstruct.run.solve_stage import AllPhotos, solve
 from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder, content_hash
+from reconstruct.run_folder.forecast import duration_text, plan_numbers
 from reconstruct.run_folder.once import Lazy, ResultFile, done_once, once
 from reconstruct.run_folder.progress import told
 from reconstruct.solve.backend import backend_name, solver_device
@@ -52,6 +54,7 @@ THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows
 THUMBNAIL_QUALITY = 88  # JPEG: artefacts do not show at this size
 KEPT_PER_PIXEL = 13  # bytes of each photo kept: three float32 and a flag
 ADDED_LATER = ("detail",)  # options that can be added to a finished run: they leave its existing results unchanged
+CALIBRATING = ("capture", "calibrate")  # stages of `shadowgraph calibrate`
 CALIBRATION_OPTIONS = ("board", "input", "lights", "split", "light_error", "ground")
 
 CALIBRATION = ResultFile("calibration.json", save_views, load_views)
@@ -72,6 +75,7 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
         )
     if run.forgotten:
         run.progress("capture", message=f"forgotten, as the run starts anew: {', '.join(sorted(run.forgotten))}")
+    _plan_time(source, options, run, stages)
     photos = Lazy(lambda: _read(source, options, run))
     calibration = once(
         run,
@@ -83,6 +87,25 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
     )
     if stages != "calibrate":
         _reconstruct(source, options, run, photos, calibration)
+
+
+def _plan_time(source: Source, options: RunOptions, run: RunFolder, stages: str) -> None:
+    """Log how many seconds the stages that are not finished should take on this machine; not of trained fields."""
+    if options.is_trained() or run.is_finished("mesh"):
+        return
+    run.activity("measuring how fast this machine is just now")
+    plan = planned_seconds(
+        solver_config(options), measure_speed(), work_of(source, options, detail_is_asked(source, options))
+    )
+    wanted = CALIBRATING if stages == "calibrate" else tuple(plan)
+    is_solved = run.is_finished("solve")
+    plan = {
+        name: seconds
+        for name, seconds in plan.items()
+        if name in wanted and not run.is_finished(name) and not (is_solved and name in ("capture", "hull"))
+    }
+    message = f"about {duration_text(whole_seconds(plan))} from here, if nothing else gets in its way"
+    run.progress("capture", message=message, numbers=plan_numbers(plan))
 
 
 def _reconstruct(
@@ -158,6 +181,7 @@ def _read(source: Source, options: RunOptions, run: RunFolder) -> AllPhotos:
         plan = _plan(source, options, run)
         if plan is not None:
             run.progress(message=plan.sentence)
+            run.activity(f"reading {len(source.photos())} photos")
         longest = 2 * options.long_side() ** 2
         has_room = shutil.disk_usage(run.path).free > KEPT_PER_PIXEL * longest * len(source.photos())
         photos = read_views(source, options, run.file(KEPT) if has_room else None, plan)
@@ -177,10 +201,9 @@ def _check(source: Source, run: RunFolder, photos: Lazy[AllPhotos], calibration:
 
 def _fitting(options: RunOptions) -> str:
     """Return the progress message of the stage "solve"."""
-    compiling = "" if kernels_are_compiled() else "; compiling its kernels first, once on this machine"
-    device = solver_device(options.device)
-    fitting = "training a field" if options.is_trained() else f"fitting the surface by {backend_name(device)}"
-    return f"{fitting}{compiling}"
+    compiling = "" if kernels_are_compiled() else "; the first run on a machine takes some 20 s longer"
+    where = backend_name(solver_device(options.device))
+    return f"{'training a field' if options.is_trained() else 'fitting the surface'} on {where}{compiling}"
 
 
 def _plan(source: Source, options: RunOptions, run: RunFolder) -> Plan | None:

@@ -14,7 +14,7 @@ from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import preview_mesh
 from reconstruct.mesh.photo_colours import PhotoColours
 from reconstruct.run.lies_stage import Lies, forget_lies, joined_scenes, lay_lies_together
-from reconstruct.run.machine import within_budget
+from reconstruct.run.machine import within_budget, work_of
 from reconstruct.run.presets import config_from_json, continued, solver_config, training
 from reconstruct.run.request_steering import RequestSteering
 from reconstruct.run_folder.folder import KEPT, RunFolder
@@ -105,7 +105,7 @@ def solve(
     device = (training_device if options.is_trained() else solver_device)(options.device)
     checkpoint = run.file("checkpoint.safetensors")
     while True:
-        resolution, config = schedule(options, run)
+        resolution, config = schedule(options, run, source)
         chosen = replace(options, preset=resolution)
         found = _photos_for(chosen, source, options, run, photos)
         scenes = prepare_views(source, seen_views(source, found, calibrated), chosen)
@@ -151,7 +151,7 @@ def _photos_for(
     return pictures
 
 
-def schedule(options: RunOptions, run: RunFolder) -> tuple[str, FitConfig | TrainConfig]:
+def schedule(options: RunOptions, run: RunFolder, source: Source) -> tuple[str, FitConfig | TrainConfig]:
     """Return the preset that sets the working size, and the solver's settings.
 
     Both are kept in config.json, so that a resumed run keeps the choice of a time budget or a visitor of the page.
@@ -174,7 +174,7 @@ def schedule(options: RunOptions, run: RunFolder) -> tuple[str, FitConfig | Trai
         ) from error
     config = solver_config(options)
     if options.time_budget is not None:
-        config = within_budget(config, options.time_budget)
+        config = within_budget(config, options.time_budget, work_of(source, options))
     run.write_json("config.json", asdict(config))
     return options.preset, config
 

@@ -237,7 +237,7 @@ class RunFolder:
             round(earlier.cpu_seconds + cpu_seconds() - cpu_start, 3),
             max(earlier.peak_memory_bytes, memory.peak),
         )
-        self.progress(name, done=1, total=1, message=f"{name} done")
+        self.progress(name, done=1, total=1, message="done")
         if self._manifest:
             self._manifest["costs"] = {k: asdict(v) for k, v in self.costs.items()}
             if leaves_files and not self._is_left_open and not self.is_finished(name):

@@ -94,9 +94,9 @@ def backend_name(device: torch.device | None) -> str:
     """Describe the backend and its device in words."""
     if device is None:
         cores = thread_count()
-        return f"fused CPU kernels (numba) on {cores} core{'s' if cores > 1 else ''}"
+        return f"{cores} processor core{'s' if cores > 1 else ''}"
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else f"the {device.type.upper()}"
-    return f"torch on {where}"
+    return where
 
 
 def surface_on(device: torch.device | None, surface: LevelSet) -> MovingSurface:

@@ -233,7 +233,7 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, tup
     state, scenes, begin, config = writer.state, task.scenes, task.begin, task.begin.config
     level = config.levels[state.level]
     first, total = (sum(x.iterations for x in levels) for levels in (config.levels[: state.level], config.levels))
-    task.say(f"reading shadows and normals from the photos for level {state.level + 1} of {len(config.levels)}")
+    task.say(f"reading shadows and slopes from the photos for round {state.level + 1} of {len(config.levels)}")
     labels = begin.labels(state.start, lit_from(scenes, state.start_shift))
     start, rays = _resumed(state, scenes, labels, level)
     if state.level == 1 and state.iteration == 0:  # later ones are nearer to the truth than any integral
@@ -247,7 +247,7 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, tup
     level_fit = LevelFit(scenes, rays, held_out, free, config, first, task.log)
     for i, losses, stopping in level_fit.steps(surface, lights, state.iteration, state.stopping):
         began, shown = time.thread_time(), surface.grid() if task.show.is_due() else None
-        message = f"level {state.level + 1} of {len(config.levels)}, {level.nodes} nodes"
+        message = f"round {state.level + 1} of {len(config.levels)}, {level.nodes} steps along the object"
         task.report(stage="solve", done=first + i + 1, total=total, message=message, numbers=losses, surface=shown)
         if shown is not None:
             task.show.shown(time.thread_time() - began)

@@ -12,24 +12,12 @@ from jaxtyping import Float
 from capture.errors import UserError
 from capture.files.regular import open_regular
 from reconstruct.run_folder.folder import LARGEST_LOG, LOG
+from reconstruct.run_folder.forecast import STAGE_NAMES, Forecast
 from reconstruct.run_folder.lock import LOCK, is_abandoned
 from reconstruct.run_folder.requests import PAUSED, REQUESTS_FOLDER
 from reconstruct.stored_run.documents import log_lines
 from reconstruct.stored_run.maps import THUMBS, read_thumbnail
 from reconstruct.stored_run.stored_run import CALIBRATION, DETAIL, FIELDS, MESH
-
-STAGE_NAMES = {
-    "capture": "Reading the photos",
-    "calibrate": "Finding camera and lights",
-    "check": "Judging the capture",
-    "observe": "Telling shadow from light",
-    "hull": "Carving the first shape",
-    "solve": "Fitting the surface",
-    "mesh": "Making the mesh",
-    "detail": "Reading the photos' full detail",
-    "report": "Writing the report",
-    "done": "Finished",
-}
 
 FIT_WORDS = {
     "loss_shadow": ("Shadows", "How far computed shadows are from those in the photos."),
@@ -55,9 +43,9 @@ class Status:
 
     title: str
     message: str = ""
-    fraction: float | None = None  # of this stage, in [0, 1]; None = unknown
-    counts: str = ""  # "34 of 120"
-    eta_s: float | None = None  # until the end of this stage
+    fraction: float | None = None  # of the whole run, in [0, 1]; None = unknown
+    counts: str = ""  # of the stage, "34 of 120"
+    eta_s: float | None = None  # until the end of the run
     elapsed_s: float = 0.0
     is_over: bool = False  # no more is coming
     is_finished: bool = False  # and the result is complete
@@ -149,19 +137,21 @@ def stage_of(lines: Sequence[Mapping[str, Any]]) -> str:
     return str(lines[-1].get("stage", "")).split("/")[0] if lines else "done"
 
 
-def status(lines: list[dict[str, Any]], is_running: bool) -> Status:
-    """Return the state that the last line of a log describes.
+def status(lines: list[dict[str, Any]], is_running: bool, since_last_line_s: float = 0.0) -> Status:
+    """Return the state that a log describes.
+
+    A run that planned no time, as that of a trained field, is as far as its stage.
 
     Args:
-        lines: the log so far.
+        lines: the log so far, whose last line was written since_last_line_s ago.
         is_running: whether a process still holds the run.
     """
     if not lines:
         return Status("Starting" if is_running else "Waiting for a run", "The log is still empty.")
-    last = lines[-1]
-    stage = str(last.get("stage", "")).split("/")[0]
+    last, forecast = lines[-1], Forecast(lines)
+    stage = forecast.stage
     name = STAGE_NAMES.get(stage, stage.capitalize() or "Working")
-    elapsed = float(last.get("t") or 0.0)
+    elapsed = float(last.get("t") or 0.0) + (since_last_line_s if is_running else 0.0)
     message = str(last.get("message") or "")
     if stage == "done":
         return Status(name, message, 1.0, elapsed_s=elapsed, is_over=True, is_finished=True)
@@ -170,9 +160,12 @@ def status(lines: list[dict[str, Any]], is_running: bool) -> Status:
         return Status(f"Stopped while {name[0].lower()}{name[1:]}", message, elapsed_s=elapsed, is_over=True)
     if message.startswith(PAUSED):
         name, message = f"Paused while {name[0].lower()}{name[1:]}", ""
-    fraction = min(done / total, 1.0) if total > 0 else None
     counts = f"{done:g} of {total:g}" if total > 1 else ""
+    forecast.at(elapsed)
+    if forecast.left_s is not None:
+        return Status(name, message, forecast.share, counts, forecast.left_s, elapsed)
     eta = last.get("eta_s")
+    fraction = min(done / total, 1.0) if total > 0 else None
     return Status(name, message, fraction, counts, None if eta is None else float(eta), elapsed)
 
 
@@ -195,9 +188,3 @@ def size_text(extents: Float[np.ndarray, "3"], unit: str) -> str:
     if unit == "mm":
         return times.join(f"{v:.1f}" for v in extents) + " mm"
     return times.join(f"{v:.3g}" for v in extents) + " units"
-
-
-def duration_text(seconds: float) -> str:
-    """Return a duration as text: "40 s", "2 min 5 s"."""
-    whole = round(seconds)
-    return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60} s"

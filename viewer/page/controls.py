@@ -8,7 +8,8 @@ import viser
 import viser.uplot
 from jaxtyping import Float
 
-from viewer.display.run_follower import Status, duration_text, residual_text
+from reconstruct.run_folder.forecast import duration_text, left_text
+from viewer.display.run_follower import Status, residual_text
 from viewer.widgets.picture_panel import MUTED, PicturePanel
 
 BRAND = (214, 137, 16)
@@ -137,10 +138,7 @@ def _status_card(now: Status, remark: str) -> str:
             '<div style="height:6px;border-radius:3px;background:rgba(128,128,128,.25);margin:.5rem 0 .35rem">'
             f'<div style="height:6px;border-radius:3px;width:{width:.0f}%;background:rgb{BRAND}"></div></div>'
         )
-    facts = [
-        now.counts,
-        "" if now.eta_s is None or now.is_over else f"about {duration_text(now.eta_s)} left in this step",
-    ]
+    facts = [now.counts, "" if now.is_over else left_text(now.eta_s)]
     facts.append(
         f"{duration_text(now.elapsed_s)} so far" if not now.is_over else f"took {duration_text(now.elapsed_s)}"
     )

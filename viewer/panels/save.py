@@ -10,9 +10,9 @@ import viser
 from capture.errors import UserError
 from reconstruct.export.export import ExportOptions, as_one_file, default_file, export
 from reconstruct.run_folder.folder import Progress as Step
+from reconstruct.run_folder.forecast import duration_text
 from reconstruct.run_folder.progress import progress
 from viewer.display.result import Result
-from viewer.display.run_follower import duration_text
 from viewer.report.formats import FORMATS
 from viewer.widgets.panel import PanelContext
 from viewer.widgets.picture_panel import MUTED

@@ -13,10 +13,11 @@ from calibration.calibration import load_calibration
 from capture.files.atomic import atomic_file
 from capture.files.regular import is_regular
 from reconstruct.run.batch import LOGS, Outcome, Task
+from reconstruct.run_folder.forecast import duration_text
 from reconstruct.stored_run.ply import read_mesh
 from reconstruct.stored_run.stored_run import CALIBRATION, MESH
 from viewer.display.pictures import mesh_picture
-from viewer.display.run_follower import duration_text, size_text
+from viewer.display.run_follower import size_text
 from viewer.report import document as doc
 from viewer.report.pictures import view_from_camera
 

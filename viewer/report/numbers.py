@@ -11,7 +11,8 @@ from calibration.calibration import Calibration
 from calibration.light import Light
 from reconstruct.check.light_coverage import widest_gap
 from reconstruct.check.readiness import WIDE_GAP
-from viewer.display.run_follower import STAGE_NAMES, duration_text, loss_curves, residual_text
+from reconstruct.run_folder.forecast import STAGE_NAMES, duration_text
+from viewer.display.run_follower import loss_curves, residual_text
 from viewer.report import document as doc
 from viewer.report.figures import coverage, curves, lights_from_above
 
