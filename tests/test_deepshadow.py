@@ -65,8 +65,8 @@ def test_an_unknown_ground_is_an_assumption_that_the_result_names(tmp_path):
     source = open_source(tmp_path, options)
     calibration = calibrate_source(source, read_photos(source, options), options)
     assert not source.ground_is_known(options)
-    assert "assumed" in calibration.residuals["notes"][-1]
     assert "ground is unknown" in calibration.residuals["warnings"][-1]
+    assert "assumed" in calibration.residuals["warnings"][-1]
 
 
 def test_a_given_height_is_the_ground(tmp_path):

@@ -100,6 +100,31 @@ def test_intensities_are_powers_and_sixteen_bits_are_linear(tmp_path):
     assert any("focal length 320 px" in note for note in known.notes) and any("scale" in note for note in known.notes)
 
 
+@pytest.mark.parametrize(("folder", "named"), [("images", ""), ("Objects", "Objects/"), ("data", None)])
+def test_photos_of_this_layout_may_lie_in_a_folder_beside_the_lists(tmp_path, folder, named):
+    """Named by their names, by folder and name, or not at all."""
+    truth = seen_from_above(side=32, n_lights=6)
+    write_diligent(tmp_path, truth, np.ones((6, 3)))
+    (tmp_path / folder).mkdir()
+    names = [f"{i:03d}.png" for i in range(1, 7)]
+    for name in (*names, "mask.png"):
+        (tmp_path / name).rename(tmp_path / folder / name)
+    lines = "" if named is None else "".join(f"{named}{name}\n" for name in names)
+    (tmp_path / "filenames.txt").write_text(lines) if lines else (tmp_path / "filenames.txt").unlink()
+    known = loaded(tmp_path)
+    assert [path.relative_to(tmp_path).as_posix() for path in known.rgb_paths or ()] == [f"{folder}/{x}" for x in names]
+    assert known.mask_path is not None
+
+
+@pytest.mark.parametrize("curve", ["sRGB", "linear8", "linear16"])
+def test_eight_bits_of_this_layout_are_read_as_their_shading_says(tmp_path, curve):
+    truth = seen_from_above((Sphere((0, 0, 40), 25),), side=48, n_lights=10)
+    write_diligent(tmp_path, truth, np.ones((10, 3)))
+    for i, rgb in enumerate(truth.stack.rgb):
+        write_photo(tmp_path / f"{i + 1:03d}.png", rgb * truth.mask[..., None], curve)
+    assert loaded(tmp_path).is_linear == (curve != "sRGB")
+
+
 def test_directions_in_columns_are_read_and_photos_go_by_number_without_a_list(tmp_path):
     truth = seen_from_above(side=32, n_lights=11)
     write_diligent(tmp_path, truth, np.ones((11, 3)))
@@ -176,7 +201,7 @@ def test_a_list_that_fits_the_photos_in_part_is_explained(tmp_path):
     ("change", "words"),
     [
         (lambda lines: lines, None),
-        (lambda lines: [flipped(line) for line in lines], "one axis of the list seems to point the other way"),
+        (lambda lines: [flipped(line) for line in lines], "'x -y z' for x y z"),
         (
             lambda lines: [
                 f"{a.split()[0]} {b.split(maxsplit=1)[1]}" for a, b in zip(lines, [*lines[5:], *lines[:5]], strict=True)

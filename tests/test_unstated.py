@@ -14,8 +14,11 @@ SIDE, PHOTOS = 40, 12
 POWERS = np.random.default_rng(1).permutation(np.geomspace(0.2, 1.0, PHOTOS))
 
 
-def sphere_folder(folder, powers, curve, order=None):
-    """Photos of a Lambert sphere in the dark, albedo 0.9, and the directional lights that are listed for them."""
+def sphere_folder(folder, powers, curve, order=None, gloss=(0.0, 1.0)):
+    """Photos of a sphere in the dark, albedo 0.9, and the directional lights that are listed for them.
+
+    gloss: of its highlights, how bright before the matt part and how sharp (Blinn's exponent).
+    """
     v, u = np.mgrid[:SIDE, :SIDE]
     x, y = (u - SIDE / 2 + 0.5) / (0.45 * SIDE), -(v - SIDE / 2 + 0.5) / (0.45 * SIDE)
     inside = x**2 + y**2 < 1
@@ -24,7 +27,10 @@ def sphere_folder(folder, powers, curve, order=None):
     towards = np.stack([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)], -1)
     photos = [folder / f"{i:02d}.png" for i in range(PHOTOS)]
     for path, light, power in zip(photos, towards, powers, strict=True):
-        grey = 0.9 * power * np.clip(normals @ light, 0, None)
+        half = light + np.array([0, 0, 1])
+        half /= np.linalg.norm(half)
+        mirrored = gloss[0] * np.clip(normals @ half, 0, None) ** gloss[1] * (normals @ light > 0)
+        grey = 0.9 * power * (np.clip(normals @ light, 0, None) + mirrored) / (1 + gloss[0])
         write_photo(path, np.repeat(grey[..., None], 3, -1), curve)
     listed = towards if order is None else towards[order]
     return photos, [distant_light(path.name, light) for path, light in zip(photos, listed, strict=True)]
@@ -42,6 +48,14 @@ def test_powers_of_one_to_five_and_the_curve_are_read_from_shading(tmp_path, cur
     assert shading.is_linear == (curve != "sRGB")
     assert log_errors(shading, POWERS).max() < 0.05
     assert any("5.0 times" in note for note in shading.notes) and any("tone curve" in note for note in shading.notes)
+
+
+@pytest.mark.parametrize("gloss", [(0.3, 20), (1, 20), (1, 100), (4, 100), (4, 400)])
+@pytest.mark.parametrize("has_power", [True, False])
+@pytest.mark.parametrize("curve", ["sRGB", "linear8"])
+def test_gloss_makes_no_other_curve(tmp_path, curve, has_power, gloss):
+    photos, lights = sphere_folder(tmp_path, np.ones(PHOTOS), curve, gloss=gloss)
+    assert read_shading(photos, lights, None, has_power).is_linear == (curve == "linear8")
 
 
 @pytest.mark.parametrize("curve", ["sRGB", "linear16"])

@@ -229,7 +229,7 @@ def _above(
         "pose_covariance": ground.covariance.tolist(),
         "sheet_waves_mm": fit.waves_mm(),
         "notes": [*notes, *_partly_seen(tripod.corners), *fit.notes],
-        "doubts": _doubts(tripod.path, tripod.corners.board, is_named),
+        "warnings": _warnings(tripod.path, tripod.corners.board, is_named),
     }
     return BoardFit(PosedCamera(fit.camera, ground.world_from_camera, 0.0), fit, residuals)
 
@@ -241,22 +241,22 @@ def _blank_notes(tripod: _Photo, corners: Sequence[Corners]) -> list[str]:
     return _check_sides(board, list(corners), tripod.grey, tripod.path.name) if isinstance(board, Blank) else []
 
 
-def _doubts(tripod: Path, board: AnyBoard, is_named: bool) -> list[str]:
+def _warnings(tripod: Path, board: AnyBoard, is_named: bool) -> list[str]:
     """Return what no picture can tell of the board, and what follows if it is otherwise."""
-    doubts = []
+    warnings = []
     if not is_named and isinstance(board, Board):
-        doubts.append(
+        warnings.append(
             f"no board was named: its squares are taken to be {board.square_mm:g} mm wide, which no photo tells. If "
             "not, every length is off by one factor, but not the shape. Measure a square and write it into --board"
         )
     lens = front_lens(tripod)
     if lens is not None and isinstance(board, Board) and board.kind == "checkerboard":
-        doubts.append(
+        warnings.append(
             f"{tripod.name} is by a front camera (EXIF: {lens}), which many phones store mirrored, and a "
             "checkerboard looks the same in a mirror: the shape may be mirrored. Take photos with the rear camera, or "
             "switch mirroring off and use a ChArUco board (shadowgraph board), which tells"
         )
-    return doubts
+    return warnings
 
 
 def _mirrored(name: str) -> CalibrationError:

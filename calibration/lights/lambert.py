@@ -5,15 +5,19 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-LIT_SHARE = 0.25  # of a pixel's brightest sample: darker ones are shadow
-ROUNDS = 3  # of leaving shadows out
+HIGH = 0.75  # quantile over photos: highlights are in fewer than a quarter of them, shadows in no more than most
+LIT_SHARE = 0.25  # of a pixel's high sample: darker ones are shadow
+OFF = 0.5  # residual over its model beyond which a sample is in shadow, or a highlight
+ROUNDS = 8  # of weighing outliers down: the residual stands still
 BRIGHT = 0.3  # of the brightest tenth: pixels that are lit well enough to be asked
+EXPLAINED = 0.1  # relative misfit beyond which shading tells no power; a list in wrong order leaves 0.11 to 0.2
 PIXELS = 800  # of the fit of powers
 POWER_ROUNDS = 15  # of powers and normals together: the loop ends before, when nothing moves
 STILL = 1e-3  # of log power
 START_ROUNDS = 8  # of powers and normals in turn, by medians
 SHARE = 0.03  # error of a sample relative to its model, beyond which its weight falls
 PRIOR = 1.0  # spread of log powers before a photo was seen: it decides only what shading cannot
+LEAST_SHARE = 0.02  # residual over its model below which samples weigh alike: what 8 bits resolve of a dark picture
 NEIGHBOURS = 25.0  # thinned pixels that share the error of their surface: each counts as one over this
 LEAST_COSINE = 0.1  # to the light, of samples whose ratio to the model tells a power
 
@@ -27,29 +31,40 @@ class FreePowers:
     misfit: float  # relative residual of the lit samples, median pixel
 
 
+def high_samples(values: Float[np.ndarray, "photos pixels"]) -> Float[np.ndarray, " pixels"]:
+    """Return how bright each pixel is where its light is good, highlights left out."""
+    return np.quantile(values, HIGH, axis=0)
+
+
 def asked_pixels(values: Float[np.ndarray, "photos pixels"]) -> Bool[np.ndarray, " pixels"]:
     """Return which pixels are lit well enough to be asked."""
-    brightest = values.max(0)
-    return brightest > BRIGHT * np.quantile(brightest, 0.9)
+    high = high_samples(values)
+    return high > BRIGHT * np.quantile(high, 0.9)
 
 
 def lambert(
-    values: Float[np.ndarray, "photos pixels"], towards: Float[np.ndarray, "photos 3"]
+    values: Float[np.ndarray, "photos pixels"],
+    towards: Float[np.ndarray, "photos 3"],
+    lit: Bool[np.ndarray, "photos pixels"] | None = None,
 ) -> tuple[Float[np.ndarray, "pixels 3"], Bool[np.ndarray, "photos pixels"]]:
-    """Return albedo times normal of every pixel by least squares, and the samples taken as lit.
+    """Return albedo times normal of every pixel by least absolute residuals, and the samples taken as lit.
 
-    I = albedo n . l (Woodham 1980), without samples in shadow.
+    I = albedo n . l (Woodham 1980), without samples in shadow. A highlight far above the model pulls no more than a
+    sample just above it.
 
     Args:
         values: linear, over the lights' powers.
         towards: unit directions.
+        lit: the samples to take; None: all that no shadow darkens.
     """
-    lit = values > LIT_SHARE * values.max(0)
-    scaled = np.zeros((values.shape[1], 3))
+    bright = values > LIT_SHARE * high_samples(values) if lit is None else lit
+    taken, scaled = bright, _solved(values, bright, towards)
     for _ in range(ROUNDS):
-        scaled = _solved(values, lit, towards)
-        lit &= values > 0.5 * (towards @ scaled.T)
-    return scaled, lit
+        model = towards @ scaled.T
+        taken = bright & (values > (1 - OFF) * model) if lit is None else lit
+        size = np.maximum(np.abs(model), LEAST_COSINE * np.linalg.norm(scaled, axis=1) + 1e-9)
+        scaled = _solved(values, taken / np.maximum(np.abs(values - model) / size, LEAST_SHARE), towards)
+    return scaled, taken
 
 
 def relative_misfit(
@@ -57,26 +72,12 @@ def relative_misfit(
     model: Float[np.ndarray, "photos pixels"],
     lit: Bool[np.ndarray, "photos pixels"],
 ) -> float:
-    """Return the residual of the lit samples over their brightness, median over the pixels."""
-    off = np.where(lit, np.abs(values - model), 0).sum(0) / np.maximum((values * lit).sum(0), 1e-9)
-    return float(np.median(off))
+    """Return the residual of the lit samples over their brightness, median over the pixels.
 
-
-def unexplained_share(values: Float[np.ndarray, "photos pixels"], towards: Float[np.ndarray, "photos 3"]) -> float:
-    """Return the residual of the lit samples over their own spread between photos, summed over the pixels asked.
-
-    Other than the relative residual it does not shrink with the contrast, so it compares tone curves. Sums, because a
-    flat ground, which may fill most of the picture, agrees with any curve once powers are free.
-
-    Args:
-        values, towards: as for lambert.
+    A sample above its model counts no more than one at the edge of shadow: a highlight is not Lambert's to explain.
     """
-    values = values[:, asked_pixels(values)]
-    scaled, lit = lambert(values, towards)
-    count = np.maximum(lit.sum(0), 1)
-    spread = np.where(lit, np.abs(values - (values * lit).sum(0) / count), 0).sum(0)
-    off = np.where(lit, np.abs(values - towards @ scaled.T), 0).sum(0)
-    return float(off.sum() / max(spread.sum(), 1e-9))
+    off = np.minimum(np.abs(values - model), OFF * np.abs(model))
+    return float(np.median((off * lit).sum(0) / np.maximum((values * lit).sum(0), 1e-9)))
 
 
 def free_powers(values: Float[np.ndarray, "photos pixels"], towards: Float[np.ndarray, "photos 3"]) -> FreePowers:
@@ -122,9 +123,10 @@ def _gram(
     rows: Float[np.ndarray, "photos 3"],
     least: float,
 ) -> Float[np.ndarray, "pixels 3 3"]:
-    """Return the sum over photos of weight row row^T, plus a least diagonal."""
+    """Return the sum over photos of weight row row^T, plus a least diagonal: that and its share of the trace."""
     outer = (rows[:, :, None] * rows[:, None, :]).reshape(len(rows), 9)
-    return (weight.T @ outer).reshape(-1, 3, 3) + least * np.eye(3)
+    gram = (weight.T @ outer).reshape(-1, 3, 3)
+    return gram + least * (1 + np.trace(gram, axis1=1, axis2=2))[:, None, None] * np.eye(3)
 
 
 def _in_turn(

@@ -2,7 +2,8 @@
 
 `light_directions.txt` has a row `x y z` per photo (x right, y up, z towards the camera), or three rows of one column
 per photo; `light_intensities.txt`, where there is one, a row `r g b`; `filenames.txt`, where there is one, the photos
-in that order. `mask.png` is white on the object. 16-bit photos hold linear numbers; 8-bit ones are taken as sRGB.
+in that order, beside the lists or in a folder there (images/). `mask.png` is white on the object. 16-bit photos hold
+linear numbers; 8-bit ones that state no curve are read as their shading says.
 """
 
 from pathlib import Path
@@ -16,7 +17,6 @@ from calibration.scenes.distant_camera import distant_light, distant_scene, pict
 from capture.decode.formats import decode
 from capture.errors import CalibrationError
 from capture.files.json_field import read_text
-from capture.files.names import inside
 
 DIRECTIONS, INTENSITIES, NAMES, MASK = "light_directions.txt", "light_intensities.txt", "filenames.txt", "mask.png"
 
@@ -48,17 +48,19 @@ class Diligent:
                 f"{folder}: light {row + 1} is {strength[row].tolist()} from {towards[row].tolist()}; an intensity "
                 f"above 0 and a direction were needed. Correct {INTENSITIES} or {DIRECTIONS}."
             )
-        is_linear = decode(photos[0]).pixels.dtype != np.uint8
+        is_linear = True if decode(photos[0]).pixels.dtype != np.uint8 else None
         posed_camera, camera_note = picture_camera(photos[0])
         rows = zip(photos, towards, strength / strength.mean(), strict=True)
         lights = tuple(distant_light(path.name, where, power) for path, where, power in rows)
-        curve = "linear, as 16-bit files of this layout are" if is_linear else "taken as sRGB"
-        found = f"lights: {len(lights)} directions, photos {how}; pixel values {curve}"
+        curve = "; pixel values linear, as 16-bit files of this layout are" if is_linear else ""
+        found = f"lights: {len(lights)} directions, photos {how}{curve}"
         notes, has_ratios = (found, camera_note), (folder / INTENSITIES).is_file()
-        return distant_scene(photos, lights, posed_camera, folder / MASK, notes, is_linear, has_ratios=has_ratios)
+        mask = next((place / MASK for place in (folder, photos[0].parent) if (place / MASK).is_file()), folder / MASK)
+        return distant_scene(photos, lights, posed_camera, mask, notes, is_linear, has_ratios=has_ratios)
 
 
 def _photos(folder: Path, n_lights: int) -> tuple[list[Path], str]:
+    """Return the photo of each light, in the folder or one in it."""
     if not (folder / NAMES).is_file():
         return match((None,) * n_lights, folders_of(folder), folder / DIRECTIONS)
     names = [line.strip() for line in read_text(folder / NAMES).splitlines() if line.strip()]
@@ -67,10 +69,7 @@ def _photos(folder: Path, n_lights: int) -> tuple[list[Path], str]:
             f"{folder / NAMES} names {len(names)} photos and {folder / DIRECTIONS} holds {n_lights} lights; as many of "
             "both were needed."
         )
-    paths = [inside(folder, name, f"{folder / NAMES}, line {i}") for i, name in enumerate(names, 1)]
-    if len({path.name for path in paths}) < len(paths):
-        raise CalibrationError(f"{folder / NAMES} lists a photo twice; each photo was needed once. Correct the list.")
-    return paths, f"by {NAMES}"
+    return match(names, folders_of(folder), folder / NAMES)
 
 
 def _table(path: Path, n_rows: int | None = None) -> Float[np.ndarray, "rows 3"]:

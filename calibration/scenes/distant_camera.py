@@ -15,9 +15,9 @@ from calibration.light import Light, Vector
 from calibration.lights.power import with_common_power
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
-from calibration.scenes.direction_check import doubts, warned
+from calibration.scenes.list_axes import judged
 from calibration.scenes.unstated import read_shading
-from capture.decode.exif import focal_in_pixels, focal_of
+from capture.decode.exif import focal_in_pixels, focal_of, orientation_of
 from capture.decode.formats import read_exif, read_size
 
 LOOKING_DOWN = np.diag([1.0, -1.0, -1.0])  # world from camera: x right, image down is -y, forward is -z
@@ -108,7 +108,14 @@ def distant_scene(
     """
     shading = read_shading(photos, lights, is_linear, has_power or has_ratios)
     small, lights = shading.stack, shading.lights
-    calibration = Calibration.of(posed_camera, lights, unit="scene", residuals=warned(doubts(small, lights)))
+    orientation = orientation_of(read_exif(photos[0]))
+    if orientation > 1:
+        notes = (
+            *notes,
+            f"lights: the list is read over the photos as stored, EXIF orientation {orientation} not applied",
+        )
+    said = judged(small, lights, orientation)
+    calibration = Calibration.of(posed_camera, lights, unit="scene", residuals=said)
     return KnownScene(
         calibration if has_power else with_common_power(calibration, small),
         tuple(photos),

@@ -5,28 +5,30 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from calibration.light import Light
 from calibration.lights.known_ground import LONG_SIDE, preview
 from calibration.lights.lambert import (
+    EXPLAINED,
+    LIT_SHARE,
+    OFF,
     FreePowers,
     asked_pixels,
     free_powers,
+    high_samples,
     lambert,
     relative_misfit,
-    unexplained_share,
 )
 from capture.decode.formats import states_curve
-from capture.photos.photo import PhotoStack, read_stack
+from capture.photos.photo import PhotoStack, read_stack, srgb_of
 
 FEWEST = 8  # photos: three numbers per pixel and one per photo are fitted
 FEWEST_PIXELS = 100  # of the preview
 SURE = 3.0  # sigmas, by which powers must differ to count as different
 SMALLEST_SPREAD = 0.05  # of log power: less is not worth a correction
 CLEARER = 0.5  # of the residual under equal powers: free ones must leave less
-EXPLAINED = 0.1  # relative residual beyond which shading tells no power; a list in wrong order leaves more
-CLEAR_CURVE = 0.75  # of the other curve's unexplained share: 0.4 to 0.66 on photographs
+CLEAR_CURVE = 0.75  # of the other curve's unexplained share: 0.2 to 0.6 on photographs, matt and glossy
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,10 @@ class _Samples:
     """Brightness of pixels and the distant light of each photo."""
 
     values: Float[np.ndarray, "photos pixels"]  # linear, over the given powers
+    power: Float[np.ndarray, " photos"]
     towards: Float[np.ndarray, "photos 3"]
     names: tuple[str, ...]
+    pixels: Int[np.ndarray, " pixels"]  # of the preview
 
 
 def read_shading(photos: Sequence[Path], lights: Sequence[Light], is_linear: bool | None, has_power: bool) -> Shading:
@@ -69,7 +73,9 @@ def read_shading(photos: Sequence[Path], lights: Sequence[Light], is_linear: boo
     is_clear = True
     if is_linear is None and not states_curve(photos[0]):
         other = preview(photos, True)
-        is_linear, is_clear, notes = _curve(_samples(small, lights), _samples(other, lights), has_power)
+        linear = _samples(other, lights)
+        encoded = None if linear is None else _samples(small, lights, linear.pixels)
+        is_linear, is_clear, notes = _curve(encoded, linear, has_power)
         small = other if is_linear else small
     known = Shading(small, tuple(lights), bool(is_linear), notes)
     samples = None if has_power or not is_clear else _samples(small, lights)
@@ -90,8 +96,14 @@ def read_shading(photos: Sequence[Path], lights: Sequence[Light], is_linear: boo
     return replace(known, lights=powered, notes=(*notes, note))
 
 
-def _samples(stack: PhotoStack, lights: Sequence[Light]) -> _Samples | None:
-    """Return well-lit pixels that no photo clips; None for too few photos or pixels, or lights that are not distant."""
+def _samples(
+    stack: PhotoStack, lights: Sequence[Light], pixels: Int[np.ndarray, " pixels"] | None = None
+) -> _Samples | None:
+    """Return well-lit pixels that no photo clips; None for too few photos or pixels, or lights that are not distant.
+
+    Args:
+        pixels: take these instead.
+    """
     by_name = {light.photo: light for light in lights}
     if len(by_name) < len(lights):
         return None
@@ -102,14 +114,15 @@ def _samples(stack: PhotoStack, lights: Sequence[Light]) -> _Samples | None:
     chosen = [i for i, _ in rows]
     power = np.array([light.power.mean() for _, light in rows])
     values = stack.rgb[chosen].mean(-1).reshape(len(rows), -1).astype(np.float64) / power[:, None]
-    values = values[:, ~stack.clipped[chosen].any(0).reshape(-1)]
-    if values.shape[1] < FEWEST_PIXELS or not (values.max(1) > 0).all():
-        return None
-    values = values[:, asked_pixels(values)]
-    if values.shape[1] < FEWEST_PIXELS:
-        return None
+    if pixels is None:
+        pixels = np.flatnonzero(~stack.clipped[chosen].any(0))
+        if len(pixels) < FEWEST_PIXELS or not (values[:, pixels].max(1) > 0).all():
+            return None
+        pixels = pixels[asked_pixels(values[:, pixels])]
+        if len(pixels) < FEWEST_PIXELS:
+            return None
     towards = np.array([light.direction for _, light in rows])
-    return _Samples(values, towards, tuple(light.photo for _, light in rows))
+    return _Samples(values[:, pixels], power, towards, tuple(light.photo for _, light in rows), pixels)
 
 
 def _different_powers(samples: _Samples) -> FreePowers | None:
@@ -126,12 +139,7 @@ def _curve(encoded: _Samples | None, linear: _Samples | None, has_power: bool) -
     """Return whether the numbers are linear, whether that is clear, and the note that says so."""
     if encoded is None or linear is None:
         return False, False, ()
-    left = []
-    for samples in (encoded, linear):
-        values = samples.values
-        if not has_power:
-            values = values / np.exp(free_powers(values, samples.towards).log_power)[:, None]
-        left.append(unexplained_share(values, samples.towards))
+    left = _unexplained(encoded, linear, has_power)
     is_linear, is_encoded = left[1] < CLEAR_CURVE * left[0], left[0] < CLEAR_CURVE * left[1]
     name = "linear" if is_linear else "sRGB"
     how = "by the photos' shading" if is_linear or is_encoded else "since shading does not decide it"
@@ -143,3 +151,30 @@ def _curve(encoded: _Samples | None, linear: _Samples | None, has_power: bool) -
             f"{left[0]:.1%} of it unexplained as sRGB, {left[1]:.1%} as linear)",
         ),
     )
+
+
+def _unexplained(encoded: _Samples, linear: _Samples, has_power: bool) -> tuple[float, float]:
+    """Return which share of the shading Lambert's law leaves unexplained if the numbers are sRGB, and if linear.
+
+    Both curves answer for the same numbers of the files, over the same samples: else the steeper one, which makes
+    shadows darker and highlights brighter, has fewer to explain. A sample above its model counts at most as much as
+    the numbers of its pixel spread between photos, as a highlight is not the law's to explain.
+    """
+    stored = linear.power[:, None] * linear.values
+    lit = stored > LIT_SHARE * high_samples(stored)
+    numbers, models = [], []
+    for samples, curve in ((encoded, srgb_of), (linear, np.asarray)):
+        power = np.ones(len(samples.values))
+        if not has_power:
+            power = np.exp(free_powers(samples.values, samples.towards).log_power)
+        scaled, _ = lambert(samples.values / power[:, None], samples.towards, lit)
+        numbers.append(curve(samples.power[:, None] * samples.values))
+        models.append(curve(np.maximum((samples.power * power)[:, None] * (samples.towards @ scaled.T), 0)))
+    lit &= stored > (1 - OFF) * np.minimum(*models)
+    known = np.ma.masked_array(stored, ~lit)
+    spread = np.ma.median(np.abs(known - np.ma.median(known, axis=0)), axis=0).filled(0.0)
+    shares = []
+    for number, model in zip(numbers, models, strict=True):
+        off = np.minimum(np.maximum(number - model, 0), spread) + np.maximum(model - number, 0)
+        shares.append(float((off * lit).sum() / max((spread * lit).sum(), 1e-9)))
+    return shares[0], shares[1]

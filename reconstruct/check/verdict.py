@@ -139,7 +139,7 @@ def _check_view(source: Source, photos: Photos, calibration: Calibration, is_par
         )
     cover = shadow_cover(build_scene(stack, calibration, LONG_SIDE, mask=photos.mask))
     doubts = tone_doubts(calibration) if source.session is not None else ()
-    doubts = (*doubts, *map(str, calibration.residuals.get("doubts", [])))
+    doubts = (*doubts, *map(str, calibration.residuals.get("warnings", [])))
     findings = with_power_changes(photos.findings, calibration, stack)
     readiness = judge(calibration, findings, cover, doubts, is_part)
     notes = tuple(map(str, calibration.residuals.get("notes", [])))

@@ -13,6 +13,7 @@ from capture.checks.check_stack import Finding
 from reconstruct.appearance.brdf import facing_reflectance
 from reconstruct.check.light_coverage import ShadowCover, directions
 from reconstruct.check.readiness import (
+    GRADES,
     MORE_LIGHTS,
     POWER_CHANGED,
     Judge,
@@ -45,7 +46,7 @@ def judge_without_ground(
     points = torch.nan_to_num(ground_points(scene), nan=0.0)
     mask = no_ground(scene).mask
     cover = _nothing_but_the_object(scene, mask > 0.5, points)
-    say = Judge([])
+    say = Judge([(GRADES.index("fair"), str(one), "") for one in calibration.residuals.get("warnings", [])])
     facts = capture_facts(calibration, findings, cover) | _shading_facts(scene, points, mask, calibration, cover)
     judge_photos(say, facts, findings)
     _judge_shading(say, facts)

@@ -61,19 +61,23 @@ def summary(
         "calibration": residuals,
         **_of_views(calibrated, solved),
         "assumptions": plain(notes),
-        "warnings": [
-            *plain(warnings),
-            *(reason for _, reason in calibrated.left_out),
-            *_reasons(run),
-            *_reduced(run),
-            *solved.doubts,
-            *misfit(_last_numbers(run)),
-            *pieces(mesh, solved),
-            *guessed(mesh),
-            *undersides(mesh, solved),
-            *_requests(run),
-            *(f"{x.photo}: {x.reason}" for one in views.values() for x in one.lights if x.used and x.reason),
-        ],
+        "warnings": list(
+            dict.fromkeys(
+                [
+                    *plain(warnings),
+                    *(reason for _, reason in calibrated.left_out),
+                    *_reasons(run),  # which hold the warnings too
+                    *_reduced(run),
+                    *solved.doubts,
+                    *misfit(_last_numbers(run)),
+                    *pieces(mesh, solved),
+                    *guessed(mesh),
+                    *undersides(mesh, solved),
+                    *_requests(run),
+                    *(f"{x.photo}: {x.reason}" for one in views.values() for x in one.lights if x.used and x.reason),
+                ]
+            )
+        ),
         "fit": _last_numbers(run),
         "refined_lights": plain(_refined_lights(calibration, solved)),
         "light_trial": _light_trial(solved),

@@ -117,15 +117,13 @@ def with_ground(calibration: Calibration, option: str, is_known: bool, has_scale
         return calibration
     away = calibration.world_from_camera.translation[2] - calibration.ground_height
     unit = "" if calibration.unit == "scene" else f" {calibration.unit}"
-    note = f"ground: unknown; the surface is assumed to lie about {away:.4g}{unit} below the camera"
     warning = (
-        f"The ground is unknown: {'' if has_scale else 'the scale of the result is an assumption, and '}slow changes "
-        "of depth over the picture may be wrong, most of all under distant lights. Give the ground's height with "
-        "--ground if you can."
+        f"the ground is unknown: the surface is assumed to lie about {away:.4g}{unit} below the camera, "
+        f"{'' if has_scale else 'the scale of the result is an assumption, and '}slow changes of depth over the "
+        "picture may be wrong, most of all under distant lights. Give the ground's height with --ground if you can"
     )
-    residuals = calibration.residuals
-    lists = {key: [*residuals.get(key, []), text] for key, text in (("notes", note), ("warnings", warning))}
-    return replace(calibration, residuals=residuals | lists)
+    warnings = [*calibration.residuals.get("warnings", []), warning]
+    return replace(calibration, residuals=calibration.residuals | {"warnings": warnings})
 
 
 def _check_above(calibration: Calibration, option: str) -> None:

@@ -1,0 +1,132 @@
+"""A list of lights that is turned or mirrored against its photos: the way that fits is said by check and run."""
+
+import json
+
+import numpy as np
+import pytest
+from dataset_folders import write_photo
+from PIL import Image
+
+import shadowgraph
+from calibration.scenes.importers import find_importer
+from calibration.scenes.list_axes import UPRIGHT, WAYS
+from capture.photos.photo import encode_srgb
+
+SIDE, PHOTOS = 48, 10
+ROWS = ("x y z", "-y x z", "-x -y z", "y -x z", "x -y z", "y x z", "-x y z", "-y -x z")  # of WAYS, to be written
+
+
+def lights():
+    azimuth, height = np.arange(PHOTOS) * 2.4, np.linspace(0.6, 1.4, PHOTOS)
+    return np.stack([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)], -1)
+
+
+def egg(x, y):
+    """A quarter of an egg's height, in the dark."""
+    return np.sqrt(np.clip(1 - (x / 0.9) ** 2 - (y / 0.6) ** 2, 0, None)) * 0.7
+
+
+def waves(x, y):
+    return 0.1 * np.sin(5 * x + y) * np.cos(4 * y)
+
+
+def saddle(x, y):
+    return 0.3 * x * y + 0.1 * x**2 + 0.08 * np.sin(6 * x - 3 * y)
+
+
+def photos_of(height):
+    """Lambert photos of a height field, albedo 0.8; black where it is 0 of a body in the dark."""
+    v, u = np.mgrid[:SIDE, :SIDE]
+    x, y = 2 * (u + 0.5) / SIDE - 1, 1 - 2 * (v + 0.5) / SIDE
+    rise = height(x, y)
+    q, p = np.gradient(rise, -2 / SIDE, 2 / SIDE)
+    normals = np.stack([-p, -q, np.ones_like(p)], -1) / np.sqrt(1 + p**2 + q**2)[..., None]
+    is_lit = rise > 0 if height is egg else np.ones_like(rise, bool)
+    return [0.8 * np.clip(normals @ light, 0, None) * is_lit for light in lights()]
+
+
+def write(folder, height, listed, turned=None):
+    """A folder with a list; `turned` stores the pictures turned for EXIF orientation of that number."""
+    folder.mkdir(exist_ok=True)
+    lines = []
+    for i, (grey, towards) in enumerate(zip(photos_of(height), listed, strict=True)):
+        name = f"{i:02d}.{'png' if turned is None else 'jpg'}"
+        rgb = np.repeat(grey[..., None], 3, -1)
+        if turned is None:
+            write_photo(folder / name, rgb)
+        else:
+            exif = Image.Exif()
+            exif[274] = turned
+            Image.fromarray(stored(encode_srgb(rgb), turned)).save(folder / name, exif=exif, quality=98)
+        lines.append(f"{name} {towards[0]:.5f} {towards[1]:.5f} {towards[2]:.5f}")
+    (folder / "lights.lp").write_text("\n".join([str(PHOTOS), *lines]))
+    return folder
+
+
+def stored(upright, orientation):
+    """The picture that a viewer turns upright by this EXIF orientation."""
+    undo = {2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM}
+    undo |= {5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_90, 7: Image.Transpose.TRANSVERSE}
+    undo[8] = Image.Transpose.ROTATE_270
+    return np.asarray(Image.fromarray(upright).transpose(undo[orientation]))
+
+
+def loaded(folder):
+    importer = find_importer(folder)
+    assert importer is not None
+    return importer.load(folder, "train")
+
+
+def warnings_of(folder):
+    return loaded(folder).calibration.residuals.get("warnings", [])
+
+
+def listed_so_that(way):
+    """Lights of a list that fits the photos once it is laid this way."""
+    found = lights()
+    found[:, :2] = found[:, :2] @ WAYS[way]
+    return found
+
+
+@pytest.mark.parametrize("height", [egg, waves, saddle])
+@pytest.mark.parametrize("way", range(8))
+def test_the_way_that_a_list_fits_is_said_with_the_figures(tmp_path, height, way):
+    said = warnings_of(write(tmp_path, height, listed_so_that(way)))
+    if way == 0 or (way == 2 and height is not egg):  # of a relief, hills and dales look the same
+        assert said == []
+        return
+    (sentence,) = said
+    assert f"'{ROWS[way]}'" in sentence and "Nothing was changed" in sentence
+    if height is egg:
+        assert f"Write '{ROWS[way]}' for x y z" in sentence
+
+
+@pytest.mark.parametrize("orientation", [2, 3, 4, 5, 6, 7, 8])
+def test_a_list_over_the_upright_pictures_is_told_by_their_orientation(tmp_path, orientation):
+    """The frame is that of the stored photos."""
+    known = loaded(write(tmp_path, egg, lights(), orientation))
+    (sentence,) = known.calibration.residuals["warnings"]
+    assert f"in the frame of the upright photos (EXIF orientation {orientation})" in sentence
+    assert f"Write '{ROWS[UPRIGHT[orientation]]}' for x y z" in sentence
+    assert any(f"EXIF orientation {orientation} not applied" in note for note in known.notes)
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 7])
+def test_a_list_over_the_stored_pictures_fits_whatever_their_orientation(tmp_path, orientation):
+    right = lights()
+    right[:, :2] = right[:, :2] @ WAYS[UPRIGHT[orientation]].T
+    assert warnings_of(write(tmp_path, egg, right, orientation)) == []
+
+
+@pytest.mark.parametrize("height", [egg, waves, saddle])
+def test_lines_in_another_order_fit_in_no_way(tmp_path, height):
+    (sentence,) = warnings_of(write(tmp_path, height, lights()[np.random.default_rng(5).permutation(PHOTOS)]))
+    assert "contradicts the listed lights" in sentence and "order" in sentence
+
+
+def test_check_says_it_too(tmp_path):
+    way = 4
+    write(tmp_path / "stone", waves, listed_so_that(way))
+    assert shadowgraph.main(["check", str(tmp_path / "stone"), "--out", str(tmp_path / "out")]) == 0
+    said = json.loads((tmp_path / "out" / "check.json").read_text())
+    assert said["verdict"] != "good" and any(f"'{ROWS[way]}'" in reason for reason in said["reasons"])
