@@ -19,7 +19,7 @@
   const behind = (e) => { for (; e; e = e.parentElement) { const c = colour(getComputedStyle(e).backgroundColor); if (c) return c; }
     return [255, 255, 255]; };
   for (const e of document.querySelectorAll("body *")) {
-    if (!shown(e) || e.closest("svg") || e.disabled || ![...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim())) continue;
+    if (!shown(e) || e.closest("svg") || ![...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim())) continue;
     const front = colour(getComputedStyle(e).color);
     if (!front) continue;
     const [a, b] = [light(front), light(behind(e))].sort((x, y) => y - x);

@@ -1,6 +1,7 @@
 """What is installed is what the README says: five import names, one command, no compiler."""
 
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -13,7 +14,7 @@ from capture.session.capture import load_capture
 from capture.session.session import ADVISED_LIT
 
 ROOT = Path(__file__).parent.parent
-SOURCES = (".py", ".typed", ".html", ".css", ".js", ".glsl", ".svg")
+SOURCES = (".py", ".typed", ".html", ".css", ".js", ".glsl", ".svg", ".zip")
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +28,7 @@ def wheel_names(tmp_path_factory) -> list[str]:
             target = copy / file.relative_to(ROOT)
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(file.read_bytes())
+    shutil.copytree(ROOT / "examples" / "spot", copy / "examples" / "spot")
     backend = "from setuptools.build_meta import build_wheel; print(build_wheel('dist'))"
     built = subprocess.run([sys.executable, "-c", backend], cwd=copy, capture_output=True, text=True, timeout=600)
     if built.returncode and "No module named 'setuptools'" in built.stderr:
@@ -36,7 +38,7 @@ def wheel_names(tmp_path_factory) -> list[str]:
 
 
 def test_the_wheel_brings_exactly_five_import_names(wheel_names):
-    tops = {name.split("/")[0] for name in wheel_names if ".dist-info" not in name}
+    tops = {name.split("/")[0] for name in wheel_names if ".dist-info" not in name and ".data/" not in name}
     assert tops == {"capture", "calibration", "reconstruct", "viewer", "shadowgraph"}
 
 
@@ -56,6 +58,12 @@ def test_the_wheel_brings_the_pages_of_the_studio(wheel_names):
     there = {path.name for path in (ROOT / "viewer" / "studio_server" / "web").iterdir()}
     assert {Path(n).name for n in wheel_names if n.startswith("viewer/studio_server/web/")} == there
     assert {"index.html", "app.js", "phone.html", "studio.css"} <= there
+
+
+def test_the_wheel_brings_the_example_of_the_studio(wheel_names):
+    there = {path.name for path in (ROOT / "examples" / "spot").rglob("*") if path.is_file()}
+    assert {Path(n).name for n in wheel_names if "/share/shadowgraph/examples/spot/" in n} == there
+    assert "viewer/studio/example.zip" in wheel_names
 
 
 def test_the_wheel_is_plain_python(wheel_names):

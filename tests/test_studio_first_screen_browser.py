@@ -21,6 +21,7 @@ on_a_page = [
 STATE = "window.shadowgraph ? window.shadowgraph.state() : null"
 SMALL = {"width": 1000, "height": 640}
 SIZES = {"desktop": DESKTOP, "phone": PHONE, "small": SMALL}
+PAGES = {"": ".card", "capture/vase": ".verdict", "run/runs%2Fvase": "h2", "run/runs%2Fheap": ".save"}
 
 
 def marked(test):
@@ -125,7 +126,7 @@ def test_keys_reach_the_result_while_a_button_has_the_focus(browser, folder, but
         for keys, part, name in (
             ("ArrowRight", "lamp", "azimuth"),
             ("Shift+ArrowRight", "view", "azimuth"),
-            ("+", "view", "distance"),
+            ("+", "view", "focal"),
             ("2", "shown", "look"),
         ):
             before = stage.evaluate(STATE)

@@ -87,12 +87,16 @@ def read_stage_pack(run_dir: Path, path: Path) -> StagePack | None:
     Raises:
         OSError: the run has no results.
     """
-    marks = marks_of(run_dir)
+    marks, pack = marks_of(run_dir), opened_pack(path)
+    return pack if pack is not None and pack.facts.get("madeOf") == marks else None
+
+
+def opened_pack(path: Path) -> StagePack | None:
+    """Return the archive at `path` if it is whole and of this format; else None."""
     try:
-        pack = StagePack(read_regular(path, LARGEST))
+        return StagePack(read_regular(path, LARGEST))
     except (OSError, ValueError, KeyError, TypeError, EOFError, CaptureError, zipfile.BadZipFile):
         return None
-    return pack if pack.facts.get("madeOf") == marks else None
 
 
 def stage_archive(run_dir: Path, facts: Mapping[str, Any], parts: Mapping[str, bytes]) -> bytes:

@@ -1,6 +1,7 @@
 """Studio: everything that the pages can ask for, put together and kept going."""
 
 import contextlib
+import shutil
 import threading
 import traceback
 from collections.abc import Callable
@@ -24,6 +25,7 @@ from reconstruct.run.queue import FINISHED, RUNNING, Job, Queue
 from viewer.stage.files import StageFiles
 from viewer.studio.boards import checked_spec
 from viewer.studio.checking import Checks
+from viewer.studio.example import TITLE, example_photos
 from viewer.studio.folder import StudioFolder
 from viewer.studio.growing import Growing
 from viewer.studio.helper import Helper
@@ -215,6 +217,14 @@ class Studio:
         """Make an empty capture and return its key."""
         with self._lock:
             return self.folder.key(self.folder.new_capture(title))
+
+    def try_example(self) -> str:
+        """Make a capture of the example's photos, put a first look at it into the queue, and return the run's key."""
+        photos = example_photos()
+        with self._lock:
+            capture = self.folder.new_capture(TITLE)
+            shutil.copytree(photos, capture, dirs_exist_ok=True)
+            return self.start_run(self.folder.key(capture), PRESETS[0])
 
     def rename(self, key: str, title: str) -> None:
         """Give a capture, and its runs that have the same title, or a run another one; folders keep their names."""

@@ -14,9 +14,10 @@ from starlette.routing import Route
 
 from capture.errors import CaptureError
 from capture.files.regular import is_regular, read_regular
-from viewer.stage.files import HEADERS
+from viewer.stage.files import HEADERS, HTML
 from viewer.stage.page import page_policy
 from viewer.studio import boards
+from viewer.studio.example import example_page
 from viewer.studio.page_words import document_in_page_words
 from viewer.studio.studio import Studio
 from viewer.studio_server.gate import FRAMED_POLICY, read_body, read_object, sentences, text_of
@@ -75,6 +76,7 @@ def _questions(studio: Studio, phones: Phones) -> list[Route]:
         ask("/api/saved", lambda r: studio.saving.asked(_key(r))),
         ask("/download", lambda r: _download(studio.saving.file(_key(r), *(r.query_params.get(n, "") for n in SAVED)))),
         ask("/stage/{key:path}/", lambda r: _stage(studio, r)),
+        ask("/example/", lambda _: _example()),
         ask("/report", lambda r: _framed(studio.folder.run(_key(r)) / "report.html")),
         ask("/check_page", lambda r: _check_page(studio.checks.page(studio.folder.capture(_key(r))))),
     ]
@@ -96,6 +98,7 @@ def _changes(studio: Studio, phones: Phones) -> list[Route]:
     return [
         Route("/stage/{key:path}/stage.json", keep_document, methods=["PUT"]),
         change("new", studio.new_capture, "title"),
+        change("try_example", studio.try_example),
         change("add", studio.folder.add, "key"),
         change("rename", studio.rename, "key", "title"),
         change("delete", studio.delete, "key"),
@@ -128,6 +131,11 @@ def _stage(studio: Studio, request: Request) -> Response:
     page = files.get("")
     assert page is not None
     return Response(page.content, media_type=page.kind, headers=STAGED)
+
+
+def _example() -> Response:
+    page = example_page()
+    return Response("", 404) if page is None else Response(page, media_type=HTML, headers=STAGED)
 
 
 async def _keep_document(studio: Studio, request: Request) -> Response:

@@ -2,6 +2,7 @@
 
 import { attempt, bytes, change, day, dialog, duration, h, key, picture, plural, presetWords, size, toast } from "./dom.js";
 import { queue } from "./queue.js";
+import { frame } from "./result.js";
 
 const WORDS = {
   arriving: "Photos are arriving", checking: "Being checked", checked: "Checked", new: "New", waiting: "In the queue",
@@ -27,12 +28,12 @@ export function home(_, again) {
         isEmpty ? null : h("input", { type: "search", placeholder: "Search", "aria-label": "Search captures", value: wanted,
           oninput: (event) => { wanted = event.target.value.toLowerCase(); again(); } }),
         isEmpty ? null : h("button", { class: "main", onclick: fresh }, "New capture"),
-        h("button", { onclick: () => choose(ask, again) }, "Add a folder"),
+        isEmpty ? null : h("button", { onclick: () => choose(ask, again) }, "Add a folder"),
         chosen.length === 2 && h("a", { class: "button", href: `#/compare/${chosen.map(key).join("|")}` }, "Compare the two")),
       state.free < 2 * state.keep_free && h("p", { class: "warn" },
         `The disk has ${bytes(state.free)} free; runs need more. Empty the trash, or make room.`),
       queue(state.queue, again),
-      isEmpty ? empty() : cards.length === 0 ? h("p", { class: "quiet" }, `Nothing is called "${wanted}".`) : null,
+      isEmpty ? empty(ask) : cards.length === 0 ? h("p", { class: "quiet" }, `Nothing is called "${wanted}".`) : null,
       h("ul", { class: "cards" }, cards.map((card) => tile(card))),
       trash(state.trash),
     ].filter(Boolean);
@@ -43,14 +44,21 @@ export function home(_, again) {
     if (title !== null) location.hash = `#/capture/${key(await change("new", { title: title.trim() || "Capture" }))}`;
   });
 
-  function empty() {
-    return h("section", { class: "panel" }, h("h2", {}, "From photos to a thing on the screen"),
+  const tryExample = () => attempt(async () => { location.hash = `#/run/${key(await change("try_example"))}`; });
+
+  function empty(ask) {
+    return h("section", { class: "panel pair welcome" }, h("div", { class: "shown" }, frame("/example/", "An example, to relight and turn"),
+      h("p", { class: "small quiet" }, "Made of 36 photos. Move over it: the light follows. Drag to turn it.")),
+    h("div", {}, h("h2", {}, "From photos to a thing on the screen"),
       h("p", {}, "Shadowgraph makes a solid, measured model of an object from photos of it and its shadows. It takes a camera or phone on a tripod, a flashlight, and a room that can be made dark."),
+      h("div", { class: "bar" }, h("button", { class: "main", onclick: fresh }, "New capture"),
+        h("button", { onclick: tryExample }, "Try the example"),
+        h("button", { onclick: () => choose(ask, again) }, "Add a folder")),
+      h("p", { class: "small quiet" }, "The example does the same with photos that are here already, in a minute or two."),
       h("ol", { class: "plain steps" },
         h("li", {}, h("b", {}, "Board. "), "Print a page with squares, or take a blank sheet of paper: it tells how large things are. Photograph it on the table in room light."),
         h("li", {}, h("b", {}, "Photos. "), "Put the object on the table, make the room dark, and take 15 to 40 photos; hold the flashlight in another place for each."),
-        h("li", {}, h("b", {}, "Model. "), "Bring the photos here. You are told whether they are good, and what to photograph next; then start.")),
-      h("button", { class: "main", onclick: fresh }, "New capture"));
+        h("li", {}, h("b", {}, "Model. "), "Bring the photos here. You are told whether they are good, and what to photograph next; then start."))));
   }
 
   function tile(card) {

@@ -18,12 +18,12 @@ export function run(name, again) {
     view.pause = one.state === "running" || one.state === "waiting" ? 1000 : 4000;
     [clock, measured] = [one.progress.elapsed_s, Date.now()];
     return [
-      h("div", { class: "bar" }, h("h1", { class: "grow" }, one.title),
-        card.kind === "capture" && h("a", { class: "button", href: `#/capture/${key(card.key)}` }, "Its photos"),
+      h("h1", {}, one.title),
+      one.state === "finished" ? result(one) : progress(one, before(state.queue, one), card.kind === "capture" ? `#/capture/${key(card.key)}` : ""),
+      h("div", { class: "bar", key: "about" }, card.kind === "capture" && h("a", { class: "button", href: `#/capture/${key(card.key)}` }, "Its photos"),
         h("button", { onclick: () => rename(one) }, "Rename"),
         h("button", { class: "danger", disabled: one.state === "running" || one.state === "waiting", onclick: () => remove(one) }, "Delete"),
         h("a", { class: "button", href: "#/" }, "All captures")),
-      one.state === "finished" ? result(one) : progress(one, before(state.queue, one), card.kind === "capture" ? `#/capture/${key(card.key)}` : ""),
     ];
   };
 
@@ -55,19 +55,20 @@ export function run(name, again) {
 
   function result(one) {
     return h("div", {},
-      one.has_mesh ? frame(one) : h("p", { class: "bad" }, "This run has no result that could be shown: its mesh is missing. Start it again."),
+      one.has_mesh ? stage(one) : h("p", { class: "bad" }, "This run has no result that could be shown: its mesh is missing. Start it again."),
+      h("div", { class: "bar" }, one.has_mesh && saver.share(), one.has_mesh && h("button", { onclick: fill }, "Fill the window"),
+        one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report"),
+        h("button", { onclick: () => inspect(one) }, "Inspect in 3D")),
       h("ul", { class: "facts" }, [size(one), one.preset && presetWords(one.preset), `made in ${duration(one.progress.elapsed_s)}`,
         one.guessed !== null && one.guessed !== undefined && `${Math.round(100 * one.guessed)} % of the surface is a guess: no photo shows it`]
         .filter(Boolean).map((text) => h("li", {}, text))),
       one.verdict_sentence && h("p", {}, one.verdict_sentence),
       one.warnings.length > 0 && h("details", { class: "panel" }, h("summary", { class: "warn" }, plural(one.warnings.length, "remark")),
         h("ul", { class: "plain" }, one.warnings.map((text) => h("li", {}, text)))),
-      h("div", { class: "bar" }, one.has_mesh && h("a", { class: "button", href: stageOf(one), target: "_blank", rel: "noopener" }, "Fill the window"),
-        one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report"),
-        h("button", { onclick: () => inspect(one) }, "Inspect in 3D")),
       one.has_mesh && saver.panel());
   }
 
+  const fill = () => attempt(() => document.querySelector("iframe.result").requestFullscreen());
   const queue = (one, action) => attempt(async () => { await change("queue", { job: one.job, action }); again(); });
   const rename = (one) => attempt(async () => {
     const title = await dialog(`Rename ${one.title}`, "", "Rename", { text: one.title });
@@ -127,20 +128,22 @@ function watch(name) {
 
 const stageOf = (one) => `/stage/${one.key.split("/").map(key).join("/")}/`;
 
-/** The stage of a run; one that the run has not packed is packed at the first look. */
-function frame(one) {
-  const address = stageOf(one);
-  const element = h("iframe", { class: "result", title: `${one.title}, to relight and turn`, key: `${address} ${one.date}`,
-    sandbox: "allow-scripts allow-downloads allow-forms" });
+const stage = (one) => frame(stageOf(one), `${one.title}, to relight and turn`, one.date);
+
+/** A stage, without an origin, because it may be a stranger's; one that its run has not packed is packed at the first look. */
+export function frame(address, title, date = "") {
+  const element = h("iframe", { class: "result", title, key: `${address} ${date}`, sandbox: "allow-scripts allow-downloads allow-forms" });
   element.address = address;
   element.stays = true;
+  const later = (pause) => setTimeout(() => attempt(wait), pause);
   const wait = async () => {
+    if (!element.isConnected) return; // the page keeps the one that it has
     const response = await fetch(address, { method: "HEAD", credentials: "same-origin" });
-    if (response.status === 202) setTimeout(wait, 800);
+    if (response.status === 202) later(800);
     else if (response.ok) element.src = address;
     else await ask(address).catch((error) => element.replaceWith(h("p", { class: "bad" }, error.message)));
   };
-  attempt(wait);
+  later(0);
   return element;
 }
 
@@ -179,7 +182,7 @@ export function compare(names, again) {
     document.title = `${two[0].title} and ${two[1].title} · Shadowgraph studio`;
     return [
       h("div", { class: "bar" }, h("h1", { class: "grow" }, `${two[0].title} and ${two[1].title}`), h("a", { class: "button", href: "#/" }, "All captures")),
-      h("div", { class: "pair" }, two.map((one) => h("div", { key: one.key }, h("h2", {}, one.title), frame(one),
+      h("div", { class: "pair" }, two.map((one) => h("div", { key: one.key }, h("h2", {}, one.title), stage(one),
         h("ul", { class: "facts" }, [size(one), presetWords(one.preset), `made in ${duration(one.progress.elapsed_s)}`,
           one.guessed !== null && `${Math.round(100 * (one.guessed || 0))} % guessed`].filter(Boolean).map((text) => h("li", {}, text)))))),
     ];
