@@ -117,5 +117,7 @@ def test_an_image_is_built_from_what_the_wheel_is_made_of():
     setup, about = project["tool"]["setuptools"], project["project"]
     packages = [name.rstrip("*") for name in setup["packages"]["find"]["include"]]
     needed = {"pyproject.toml", about["readme"], *about["license-files"], *packages}
+    patterns = [pattern for several in setup["data-files"].values() for pattern in several]
+    needed |= {"/".join(pattern.split("/")[:2]) for pattern in patterns}  # the example
     assert {line[1:] for line in lines if line.startswith("!")} == needed
     assert "*" in lines and all((ROOT / name).exists() for name in needed)
