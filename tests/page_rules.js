@@ -19,11 +19,11 @@
   const behind = (e) => { for (; e; e = e.parentElement) { const c = colour(getComputedStyle(e).backgroundColor); if (c) return c; }
     return [255, 255, 255]; };
   for (const e of document.querySelectorAll("body *")) {
-    if (!shown(e) || e.closest("svg") || ![...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim())) continue;
-    const front = colour(getComputedStyle(e).color);
+    if (!shown(e) || e.closest("svg") || !(e.placeholder || [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim()))) continue;
+    const front = colour(getComputedStyle(e, e.placeholder ? "::placeholder" : null).color);
     if (!front) continue;
     const [a, b] = [light(front), light(behind(e))].sort((x, y) => y - x);
-    if ((a + 0.05) / (b + 0.05) < 4.5) bad.push("contrast: " + e.innerText.slice(0, 40));
+    if ((a + 0.05) / (b + 0.05) < 4.5) bad.push("contrast: " + (e.placeholder || e.innerText).slice(0, 40));
   }
   return bad;
 }

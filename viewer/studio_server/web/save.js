@@ -4,10 +4,14 @@ import { about, ask, attempt, change, h, key, plural, toast } from "./dom.js";
 
 /** The panel of one run; `again` draws the page anew. */
 export function saving(name, again) {
-  let isShared = false, formats = null, chosen = "html", size = "", files = [], timer = 0, isClosed = false;
+  let isShared = false, formats = null, chosen = "", size = "", files = [], timer = 0, isClosed = false;
   const begun = new Map(); // file -> when it was first seen under way, and which share was done then
 
-  ask("/api/formats").then((rows) => { formats = rows; refresh(); }, () => {});
+  ask("/api/formats").then((rows) => {
+    formats = rows.filter((one) => one.name !== "html"); // the page is what Share makes
+    chosen = formats[0].name;
+    refresh();
+  }, () => {});
 
   const wish = (one) => ({ key: name, format: one.name, size: one.size });
   const idOf = (one) => `${one.name} ${one.size}`;
@@ -83,7 +87,7 @@ export function saving(name, again) {
 
   function panel() {
     if (!formats) return null;
-    const kind = formats.find((one) => one.name === chosen) || formats[0], now = there();
+    const kind = formats.find((one) => one.name === chosen), now = there();
     return h("section", { class: "panel save", key: "save" }, h("h2", {}, "Take it with you"),
       h("div", { class: "bar" },
         h("select", { "aria-label": "Kind of file", value: chosen, onchange: (event) => { chosen = event.target.value; again(); } },
