@@ -22,6 +22,7 @@ class KnownScene:
     left_out: tuple[float, float, float] | None = (
         None  # x, y, radius (px) of what is no object: a ball that shows light
     )
+    dark_paths: tuple[Path, ...] = ()  # photos without light, which are subtracted
     lights_from: Path | None = None  # the user's file of lights that they come from
     notes: tuple[str, ...] = ()  # what was found, and what had to be assumed
 

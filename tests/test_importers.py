@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.io
 import torch
 from dataset_folders import (
     from_above,
@@ -385,6 +386,49 @@ def test_a_list_that_lacks_photos_without_a_board_says_what_both_would_need(tmp_
     (tmp_path / "some.lp").write_text("stone_01.png 0 0 1\nother.png 0 1 1\n")
     with pytest.raises(CaptureError, match=r"board in room light.*lists 2 lights .* holds 6 photos"):
         open_source(capture, RunOptions(lights=str(tmp_path / "some.lp")))
+
+
+def no_lights(path):
+    scipy.io.savemat(path, {"albedo": np.ones((4, 4))})
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("light.mat", no_lights),
+        ("two.lp", "stone_01.png 0.1 0.2\nstone_02.png 0.3 0.1\n"),
+        ("lights.csv", "photo,hue,gain\nstone_01.png,1,2\n"),
+        ("photo.lp", b"\x89PNG\r\n\x1a\n\0\0\0"),
+        ("lights.json", '{"suns": []}'),
+        ("places.csv", "photo,x,y,z\n" + "".join(f"stone_{i:02d}.png,{30 * i},90,-500\n" for i in range(1, 7))),
+        ("places_mm.csv", "photo,x_mm,y_mm,z_mm\n" + "".join(f"stone_{i:02d}.png,9,9,500\n" for i in range(1, 7))),
+        ("near.csv", "photo,x,y,z\n" + "".join(f"stone_{i:02d}.png,{i},1,2\n" for i in range(1, 7))),
+    ],
+)
+def test_a_file_that_the_user_names_is_the_one_that_is_refused(tmp_path, name, content):
+    """Not its photos, in which then a board is looked for."""
+    write_rti(tmp_path / "theirs", seen_from_above(side=32, n_lights=6))
+    capture, file = tmp_path / "capture", tmp_path / name
+    (tmp_path / "theirs" / "jpeg-exports").rename(capture)
+    file.write_bytes(content) if isinstance(content, bytes) else content(file) if callable(
+        content
+    ) else file.write_text(content)
+    with pytest.raises(CalibrationError) as refused:
+        open_source(capture, RunOptions(lights=str(file)))
+    said = str(refused.value)
+    assert str(file) in said and "board in" not in said and ("Lights are read from" in said or "needed" in said)
+
+
+def test_places_in_pixels_are_lights_of_photos_without_a_board(tmp_path):
+    truth = seen_from_above(side=32, n_lights=6)
+    write_rti(tmp_path / "theirs", truth)
+    capture = tmp_path / "capture"
+    (tmp_path / "theirs" / "jpeg-exports").rename(capture)
+    expected = towards_lights(truth) * np.linspace(90, 200, 6)[:, None]
+    scipy.io.savemat(tmp_path / "light.mat", {"S": expected})
+    known = open_source(capture, RunOptions(lights=str(tmp_path / "light.mat"))).known
+    assert known is not None and any("as places from the picture's middle" in note for note in known.notes)
+    np.testing.assert_allclose(np.array([light.position for light in known.calibration.lights]), expected, atol=1e-6)
 
 
 def test_a_calibration_of_another_run_brings_camera_and_ground_to_photos_without_a_board(tmp_path):

@@ -1,11 +1,13 @@
 """Lights from files of other programs: each layout written from known lights and read back into the world frame."""
 
 import json
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
 from flashlight_photos import CAMERA, POSED_CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights, photograph
 
 from calibration.calibrate_with_file import with_opinions
@@ -217,3 +219,104 @@ def test_the_power_of_given_lights_comes_from_the_ground_and_wrong_lights_are_no
     wrong = with_power_per_photo(shuffled, stack, POSED_CAMERA, np.ones(6, bool))
     assert right.warning() == "" and right.misfit < SHADING_MISFIT < wrong.misfit
     assert "photos' order" in wrong.warning()
+
+
+# --- tables and arrays -----------------------------------------------------------------------------------------------
+
+
+def unit_directions() -> np.ndarray:
+    return directions() / np.linalg.norm(directions(), axis=1, keepdims=True)
+
+
+def angles(vectors):
+    return np.arctan2(vectors[:, 1], vectors[:, 0]), np.arcsin(vectors[:, 2])
+
+
+@pytest.mark.parametrize(
+    ("head", "columns"),
+    [
+        ("photo,azimuth,elevation", lambda a, e: np.degrees([a, e])),
+        ("photo,az_rad,el_rad", lambda a, e: np.array([a, e])),
+        ("image,phi [deg],theta [deg],gain", lambda a, e: np.array([np.degrees(a), 90 - np.degrees(e), 0 * a])),
+        ("name,Elevation (deg),Azimuth (deg)", lambda a, e: np.degrees([e, a])),
+    ],
+)
+def test_a_table_of_angles_is_read_by_its_head(tmp_path, head, columns):
+    rows = columns(*angles(unit_directions())).T
+    lines = [f"{photo},{','.join(f'{x:.6f}' for x in row)}" for photo, row in zip(PHOTOS, rows, strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join([head, *reversed(lines)]))
+    given = read_lights(tmp_path / "a.csv", PHOTOS, POSED_CAMERA)
+    assert_towards_the_lights(given)
+    assert any("angles in" in note for note in given.notes)
+
+
+@pytest.mark.parametrize(
+    ("head", "scale", "kind"),
+    [
+        ("photo,x,y,z", 1.0, "point"),
+        ("photo,x_mm,y_mm,z_mm", 1.0, "point"),
+        ("photo,pos_x [cm],pos_y [cm],pos_z [cm]", 0.1, "point"),
+        ("photo,dx,dy,dz", 1.0, "directional"),
+    ],
+)
+def test_a_table_of_places_is_read_as_places(tmp_path, head, scale, kind):
+    lines = [f"{n},{','.join(f'{x:.5f}' for x in row * scale)}" for n, row in zip(PHOTOS, directions(), strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join([head, *lines]))
+    given = read_lights(tmp_path / "a.csv", PHOTOS, POSED_CAMERA)
+    if kind == "directional":
+        assert_towards_the_lights(given)
+    else:
+        np.testing.assert_allclose(places(given), PLACES, atol=1e-3)
+        assert any("as places" in note for note in given.notes)
+
+
+@pytest.mark.parametrize(
+    ("content", "kind"),
+    [
+        (lambda: {"L": unit_directions(), "mask": np.ones((3, 5)), "note": "by hand"}, "directional"),
+        (lambda: {"light_directions": unit_directions().T, "albedo": np.ones((4, 3))}, "directional"),
+        (lambda: {"S": directions(), "Dir": unit_directions(), "Phi": np.ones((4, 3))}, "point"),
+        (lambda: {"anything": np.round(unit_directions(), 4).astype(np.float32)}, "directional"),
+    ],
+)
+@pytest.mark.parametrize("packed", [True, False])
+def test_arrays_of_matlab_are_read_by_their_usual_names(tmp_path, content, kind, packed):
+    scipy.io.savemat(tmp_path / "light.mat", content(), do_compression=packed)
+    given = read_lights(tmp_path / "light.mat", PHOTOS, POSED_CAMERA)
+    if kind == "directional":
+        assert_towards_the_lights(given)
+    else:
+        np.testing.assert_allclose(places(given), PLACES, atol=1e-6)
+
+
+def test_an_array_of_numpy_is_read(tmp_path):
+    np.save(tmp_path / "lights.npy", unit_directions())
+    assert_towards_the_lights(read_lights(tmp_path / "lights.npy", PHOTOS, POSED_CAMERA))
+
+
+def bomb(path: Path) -> None:
+    """A part of 200 MB in 200 kB."""
+    scipy.io.savemat(path, {"L": unit_directions()})
+    packed = zlib.compress(bytes(200 << 20))
+    path.write_bytes(path.read_bytes()[:128] + (15).to_bytes(4, "little") + len(packed).to_bytes(4, "little") + packed)
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (
+            lambda path: scipy.io.savemat(path, {"a": np.ones((2, 2)), "b": np.ones(4)}),
+            r"holds a 2 x 2, b 1 x 4; an array",
+        ),
+        (lambda path: scipy.io.savemat(path, {"L": np.array([{"a": 1}], dtype=object)}), "no array of numbers"),
+        (lambda path: scipy.io.savemat(path, {"L": np.full((4, 3), np.nan)}), "L is 4 x 3; three finite numbers"),
+        (lambda path: path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM\x89HDF"), "version 7.3"),
+        (lambda path: path.write_bytes(b"\x89PNG" * 100), "cannot be read as MATLAB's file"),
+        (bomb, "unpacks to more than 64 MB"),
+    ],
+)
+def test_a_wrong_matlab_file_is_refused_by_what_is_wrong(tmp_path, write, message):
+    write(tmp_path / "light.mat")
+    with pytest.raises(CalibrationError, match=message) as refused:
+        read_lights(tmp_path / "light.mat", PHOTOS, POSED_CAMERA)
+    assert "light.mat" in str(refused.value) and "Lights are read from .lp" in str(refused.value)

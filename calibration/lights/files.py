@@ -5,13 +5,14 @@
 | calibration.json | ours, whole | world |
 | lights.json | {"lights": [{"photo", "position" or "direction", "sigma", "power"}]}, the last two as you like | world |
 | .lp, .txt | [count], then `name x y z` or `x y z` per photo: directions (RTI, DiLiGenT) | picture |
-| .csv | the same between commas or semicolons, with or without a head | picture |
+| .csv | the same between commas or semicolons; a head may name angles or places | picture |
+| .mat, .npy | an array of three columns, or rows: directions or places | picture |
 | .dome | RelightLab's JSON: directions, or positions over imageWidth | picture |
 | transforms_*.json | ShadowNeuS: transform_matrix_sun per frame | its own, by its camera |
 | params.npz | ShadowNeuS, real photos: light_pose, camera_pose (OpenCV axes), floor_height | its own, by its camera |
 | params.json | S3-NeRF: light_pos, pose_c2w (looks along -z) | its own, by its camera |
 
-The picture's frame and the others: calibration.lights.layouts.
+The picture's frame: calibration.lights.number_lists; the others: calibration.lights.layouts.
 """
 
 import re
@@ -23,11 +24,16 @@ import numpy as np
 
 from calibration.calibration import load_calibration
 from calibration.light import Light, Vector
-from calibration.lights.layouts import Rows, dome_rows, s3nerf_rows, shadowneus_real_rows, shadowneus_rows, text_rows
+from calibration.lights.layouts import Rows, dome_rows, s3nerf_rows, shadowneus_real_rows, shadowneus_rows
+from calibration.lights.number_lists import READABLE, number_rows
 from calibration.lights.photo_lists import bare
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.files.json_field import LARGEST_FILE, JsonField, read_json, read_text
+
+
+class NoMatchError(CalibrationError):
+    """A file of lights can be read, but not all photos are in it."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,7 @@ class GivenLights:
     beam: tuple[float, ...] = ()
     ambient: Vector | None = None
     notes: tuple[str, ...] = ()
+    unit: str = ""  # of places, where the file names one
     is_by_number: bool = False  # matched by the numbers in the photos' names, of a list that is longer
 
 
@@ -55,8 +62,8 @@ def read_lights(path: Path, photos: Sequence[str], posed_camera: PosedCamera) ->
         raise CalibrationError(f"{path} is not a file of at most {LARGEST_FILE >> 20} MB; a file of lights was needed.")
     if path.suffix.lower() == ".npz":
         return _matched(shadowneus_real_rows(path, posed_camera), photos, path)
-    if is_text_list(path):
-        return _matched(text_rows(read_text(path), path, posed_camera), photos, path)
+    if is_number_list(path):
+        return _matched(number_rows(path, posed_camera), photos, path)
     content = read_json(path)
     document = JsonField(content, str(path))
     if "format" in content and "camera" in content:
@@ -70,18 +77,18 @@ def read_lights(path: Path, photos: Sequence[str], posed_camera: PosedCamera) ->
     if "directions" in content or "positions3d" in content or "positions" in content:
         return _matched(dome_rows(document, posed_camera), photos, path)
     raise CalibrationError(
-        f"{path} is of no known kind (its entries: {', '.join(list(content)[:6]) or 'none'}); a calibration.json, a "
-        "list of 'lights', an .lp or .dome file, or the file of a ShadowNeuS or S3-NeRF scene was needed."
+        f"{path} is of no known kind (its entries: {', '.join(list(content)[:6]) or 'none'}). {READABLE}."
     )
 
 
-def is_text_list(path: Path) -> bool:
-    """Return True for a list of directions in plain text, which has no entries of JSON.
+def is_number_list(path: Path) -> bool:
+    """Return True for a list of rows of numbers: arrays, and plain text, which has no entries of JSON.
 
     Raises:
-        CalibrationError: the file cannot be read as text.
+        CalibrationError: the file cannot be read.
     """
-    return path.suffix.lower() != ".npz" and not read_text(path).lstrip().startswith("{")
+    suffix = path.suffix.lower()
+    return suffix in (".mat", ".npy") or (suffix != ".npz" and not read_text(path).lstrip().startswith("{"))
 
 
 def is_calibration(path: Path) -> bool:
@@ -150,7 +157,7 @@ def _by_name(lights: Sequence[Light], names: Sequence[str], photos: Sequence[str
         by_name.setdefault(bare(name), []).append(light)
     missing = [photo for photo in photos if bare(photo) not in by_name]
     if missing:
-        raise CalibrationError(
+        raise NoMatchError(
             f"{path} has no light for {len(missing)} of {len(photos)} photos ({missing[0]}, ...), one for each is "
             "needed. Add them, or leave --lights out."
         )
@@ -161,10 +168,11 @@ def _matched(rows: Rows, photos: Sequence[str], path: Path) -> GivenLights:
     """Match rows as lights to photos: by name, else by order, else by number."""
     known = {bare(photo) for photo in photos}
     is_named = all(name is not None for name in rows.names) and known <= {bare(n) for n in rows.names if n}
-    lights = [_light("", rows.kind, value) for value in rows.values]
+    lights = list(rows.lights())
     notes, is_by_number = [rows.note] if rows.note else [], False
     if is_named:
-        return GivenLights(_by_name(lights, [n or "" for n in rows.names], photos, path), False, notes=tuple(notes))
+        found = _by_name(lights, [n or "" for n in rows.names], photos, path)
+        return GivenLights(found, False, notes=tuple(notes), unit=rows.unit)
     if len(lights) == len(photos):
         order = list(range(len(photos)))
         notes.append(f"lights: {path.name} matched to the photos by order, not by name")
@@ -172,12 +180,12 @@ def _matched(rows: Rows, photos: Sequence[str], path: Path) -> GivenLights:
         order, is_by_number = _numbers(photos, rows.first, len(lights)), True
         notes.append(f"lights: {path.name} matched to the photos by the number in their names")
     if order is None:
-        raise CalibrationError(
+        raise NoMatchError(
             f"{path} lists {len(lights)} lights for {len(photos)} photos, and neither its names nor the numbers in the "
             "photos' names assign them; one light for each photo was needed. Name the photos in the file."
         )
     found = tuple(replace(lights[k], photo=photo) for k, photo in zip(order, photos, strict=True))
-    return GivenLights(found, False, notes=tuple(notes), is_by_number=is_by_number)
+    return GivenLights(found, False, notes=tuple(notes), unit=rows.unit, is_by_number=is_by_number)
 
 
 def _numbers(photos: Sequence[str], first: int, n_rows: int) -> list[int] | None:
@@ -186,12 +194,6 @@ def _numbers(photos: Sequence[str], first: int, n_rows: int) -> list[int] | None
     rows = [int(digits[-1]) - first for digits in found if digits]
     fits = len(rows) == len(photos) and len(set(rows)) == len(rows) and min(rows) >= 0 and max(rows) < n_rows
     return rows if fits else None
-
-
-def _light(photo: str, kind: str, value: Vector) -> Light:
-    if kind == "point":
-        return Light(photo, kind, position=value)
-    return Light(photo, kind, direction=value / np.linalg.norm(value))
 
 
 def _unit(value: Vector, field: JsonField) -> Vector:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from calibration.light import Vector
+from calibration.light import Light, Vector
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
@@ -32,55 +32,25 @@ class Rows:
     kind: str  # "point" | "directional"
     first: int = 1  # number in the name of the photo that belongs to the first row
     note: str = ""
+    unit: str = ""  # of places, where the file names one
+
+    def lights(self) -> tuple[Light, ...]:
+        """Return the light of each row, without a photo."""
+        if self.kind == "point":
+            return tuple(Light("", "point", position=value) for value in self.values)
+        return tuple(Light("", "directional", direction=value / np.linalg.norm(value)) for value in self.values)
 
 
-# --- directions over the picture -------------------------------------------------------------------------------------
+# --- over the picture ------------------------------------------------------------------------------------------------
 
 
-def text_rows(text: str, path: Path, posed_camera: PosedCamera) -> Rows:
-    """Parse RTI's .lp, DiLiGenT's light_directions.txt and tables (.csv).
-
-    Decimal commas are read (in tables between semicolons); names may hold spaces.
-
-    Raises:
-        CalibrationError: a line is no light; names it.
-    """
-    names, values = [], []
-    split = _cells if path.suffix.lower() == ".csv" else str.split
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = split(line)
-        if not words or (len(words) == 1 and not values and words[0].isdigit()) or (number == 1 and _is_head(words)):
-            continue
-        try:
-            value = [float(word.replace(",", ".")) for word in words[-3:]]
-        except ValueError:
-            value = []
-        if len(value) != 3 or not np.isfinite(value).all() or not np.any(value):
-            raise CalibrationError(f"{path}, line {number} is {line[:60]!r}; a name and x y z of its light are needed.")
-        names.append(" ".join(words[:-3]) or None)
-        values.append(value)
-    if not values:
-        raise CalibrationError(f"{path} lists no light; a line 'name x y z' for each photo is needed.")
-    return Rows(tuple(names), _turned(np.array(values), posed_camera), "directional", note=_view_note(posed_camera))
-
-
-def _cells(line: str) -> list[str]:
-    """Return the cells of a line of a table; empty for an empty line."""
-    cells = [cell.strip().strip('"') for cell in line.split(";" if ";" in line else ",")]
-    return cells if any(cells) else []
-
-
-def _is_head(words: list[str]) -> bool:
-    """Return True for the names of a table's columns."""
-    return [word.lower() for word in words[-3:]] == ["x", "y", "z"]
-
-
-def _turned(values: Float[np.ndarray, "rows 3"], posed_camera: PosedCamera) -> Float[np.ndarray, "rows 3"]:
+def turned(values: Float[np.ndarray, "rows 3"], posed_camera: PosedCamera) -> Float[np.ndarray, "rows 3"]:
     """Rotate vectors of the picture's frame to the world."""
     return posed_camera.world_from_camera.rotate(values @ BLENDER)
 
 
-def _view_note(posed_camera: PosedCamera) -> str:
+def view_note(posed_camera: PosedCamera) -> str:
+    """Return the note on directions over the picture."""
     tilt = float(np.degrees(np.arccos(np.clip(-posed_camera.world_from_camera.rotation[2, 2], -1, 1))))
     return f"lights: directions are read in the picture's axes; the camera looks {tilt:.0f} degrees off straight down"
 
@@ -102,13 +72,13 @@ def dome_rows(document: JsonField, posed_camera: PosedCamera) -> Rows:
     vectors = np.array([_xyz(entry) for entry in document[key if is_point else "directions"].entries()])
     if not vectors.size or not np.linalg.norm(vectors, axis=1).all():
         raise CalibrationError(f"{document.file}: no direction or position per light, one for each photo was needed.")
-    values = _turned(vectors, posed_camera)
+    values = turned(vectors, posed_camera)
     if is_point:
         middle = posed_camera.looked_at()
         reach = float(np.linalg.norm(middle - posed_camera.centre))
         values = middle + values * (reach * posed_camera.camera.width / posed_camera.camera.fx / width)
     kind = "point" if is_point else "directional"
-    return Rows((None,) * len(values), values, kind, note=_view_note(posed_camera))
+    return Rows((None,) * len(values), values, kind, note=view_note(posed_camera))
 
 
 def _xyz(entry: JsonField) -> Vector:

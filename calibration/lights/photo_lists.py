@@ -7,8 +7,10 @@ from pathlib import Path, PurePosixPath
 from capture.decode.formats import is_photo_name
 from capture.errors import CalibrationError
 from capture.files.names import natural_order
+from capture.session.session import ROLE_FOLDERS
 
 NOT_A_PHOTO = re.compile(r"(^|[^a-z])(mask|normal|normals|depth|albedo|silhouette)([^a-z]|$)", re.IGNORECASE)
+DARK = ROLE_FOLDERS["dark"]
 NAMED, LONGEST = 5, 60  # files listed in a message, and letters of each name
 
 
@@ -26,10 +28,15 @@ def photos_in(folder: Path) -> list[Path]:
 
 
 def folders_of(folder: Path) -> list[Path]:
-    """Return the folder and its subfolders by name, where photos may lie; links that lead outside are left out."""
+    """Return the folder and its subfolders by name, where lit photos may lie; links that lead outside are left out."""
     root = folder.resolve()
-    below = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+    below = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".") and p.name != DARK)
     return [folder, *(p for p in below if p.resolve().is_relative_to(root))]
+
+
+def dark_photos(folder: Path, photos: Sequence[Path]) -> list[Path]:
+    """Return the photos without light in dark/, in the folder of a scene or beside its photos."""
+    return photos_in(folder / DARK) or photos_in(photos[0].parent / DARK)
 
 
 def match(names: Sequence[str | None], folders: Sequence[Path], source: Path) -> tuple[list[Path], str]:

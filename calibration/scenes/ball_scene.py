@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from calibration.known_scene import KnownScene
-from calibration.lights.photo_lists import photos_in
+from calibration.lights.photo_lists import dark_photos, photos_in
 from calibration.lights.shiny_ball import GROWN, Ball, find_ball, lights_of
 from calibration.scenes.distant_camera import distant_light, distant_scene, picture_camera
 from capture.errors import CalibrationError, CaptureError
@@ -61,5 +61,7 @@ def load_with_ball(folder: Path, circle: tuple[float, float, float] | None) -> K
         f"lights: directions from the highlights on a shiny ball at ({ball.x:.0f}, {ball.y:.0f}), radius "
         f"{ball.radius:.0f} px, {how}; within {degrees:.1f} degrees at worst. The ball is left out of the object"
     )
-    scene = distant_scene(photos, lights, posed_camera, photos[0].parent / MASK, (note, camera_note))
+    scene = distant_scene(
+        photos, lights, posed_camera, photos[0].parent / MASK, (note, camera_note), dark=dark_photos(folder, photos)
+    )
     return replace(scene, left_out=(ball.x, ball.y, GROWN * ball.radius))

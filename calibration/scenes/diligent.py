@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.known_scene import KnownScene
-from calibration.lights.photo_lists import folders_of, match, photos_in
+from calibration.lights.photo_lists import dark_photos, folders_of, match, photos_in
 from calibration.scenes.distant_camera import distant_light, distant_scene, picture_camera
 from capture.decode.formats import decode
 from capture.errors import CalibrationError
@@ -56,7 +56,16 @@ class Diligent:
         found = f"lights: {len(lights)} directions, photos {how}{curve}"
         notes, has_ratios = (found, camera_note), (folder / INTENSITIES).is_file()
         mask = next((place / MASK for place in (folder, photos[0].parent) if (place / MASK).is_file()), folder / MASK)
-        return distant_scene(photos, lights, posed_camera, mask, notes, is_linear, has_ratios=has_ratios)
+        return distant_scene(
+            photos,
+            lights,
+            posed_camera,
+            mask,
+            notes,
+            is_linear,
+            has_ratios=has_ratios,
+            dark=dark_photos(folder, photos),
+        )
 
 
 def _photos(folder: Path, n_lights: int) -> tuple[list[Path], str]:

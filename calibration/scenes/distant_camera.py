@@ -4,6 +4,7 @@ x right, y up, z towards the camera, origin in the middle of the picture; one un
 focal length is EXIF's, or that of a camera far away.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from calibration.scenes.list_axes import judged
 from calibration.scenes.unstated import read_shading
 from capture.decode.exif import focal_in_pixels, focal_of, orientation_of
 from capture.decode.formats import read_exif, read_size
+from capture.errors import CaptureError
 
 LOOKING_DOWN = np.diag([1.0, -1.0, -1.0])  # world from camera: x right, image down is -y, forward is -z
 FAR = 10.0  # focal length over the picture's longer side: rays are parallel to 3 degrees, as a long lens's are
@@ -90,6 +92,7 @@ def distant_scene(
     is_linear: bool | None = None,
     has_power: bool = False,
     has_ratios: bool = False,
+    dark: Sequence[Path] = (),
 ) -> KnownScene:
     """Return the scene of a picture's own camera over an unknown ground, with warnings if photos contradict the lights.
 
@@ -100,13 +103,21 @@ def distant_scene(
         notes: how lights and camera were found, for the report.
         is_linear: pixel values in the photos are linear, or sRGB-encoded; None: as the files or their shading say.
         has_power: the lights come with powers on the photos' scale, which stay as they are.
+        dark: photos without light, which are subtracted; those that do not fit are left out with a warning.
         has_ratios: only the ratios of the powers stay; without either, shading may say that the powers differ.
 
     Raises:
         CaptureError: a photo cannot be read.
         CalibrationError: no pixel sees the ground under any light.
     """
-    shading = read_shading(photos, lights, is_linear, has_power or has_ratios)
+    unused: list[str] = []
+    try:
+        shading = read_shading(photos, lights, is_linear, has_power or has_ratios, dark)
+    except CaptureError as error:
+        if not dark:
+            raise
+        unused, dark = [f"{dark[0].parent} is not used: {error}"], ()
+        shading = read_shading(photos, lights, is_linear, has_power or has_ratios)
     small, lights = shading.stack, shading.lights
     orientation = orientation_of(read_exif(photos[0]))
     if orientation > 1:
@@ -114,8 +125,10 @@ def distant_scene(
             *notes,
             f"lights: the list is read over the photos as stored, EXIF orientation {orientation} not applied",
         )
-    said = judged(small, lights, orientation)
-    calibration = Calibration.of(posed_camera, lights, unit="scene", residuals=said)
+    if dark:
+        notes = (*notes, f"room light: {len(dark)} photos in {dark[0].parent.name}/ are subtracted from the others")
+    residuals = {"warnings": [*unused, *judged(small, lights, orientation)]}
+    calibration = Calibration.of(posed_camera, lights, unit="scene", residuals=residuals)
     return KnownScene(
         calibration if has_power else with_common_power(calibration, small),
         tuple(photos),
@@ -124,5 +137,6 @@ def distant_scene(
         mask_is_grey=True,
         ground_known=False,
         is_linear=shading.is_linear,
+        dark_paths=tuple(dark),
         notes=(*notes, *shading.notes, SCALE_NOTE),
     )

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -95,8 +94,8 @@ def _bent(
     return np.stack([right, -down], axis=-1)  # rows run down, y up
 
 
-def judged(stack: PhotoStack, lights: Sequence[Light], orientation: int) -> dict[str, Any]:
-    """Return what the user should know of a list's axes, as the entry "warnings" of Calibration.residuals.
+def judged(stack: PhotoStack, lights: Sequence[Light], orientation: int) -> list[str]:
+    """Return warnings about a list's axes, or the order of its lines; none if the photos agree with it.
 
     Args:
         stack, lights: as try_axes takes them.
@@ -104,19 +103,17 @@ def judged(stack: PhotoStack, lights: Sequence[Light], orientation: int) -> dict
     """
     tested = try_axes(stack, lights)
     if tested is None:
-        return {}
+        return []
     way, upright = tested.best(), UPRIGHT[orientation]
     if way is None and tested.misfit > EXPLAINED:
-        return {
-            "warnings": [
-                f"the photos' shading contradicts the listed lights: it leaves {tested.misfit:.0%} of the brightness "
-                f"unexplained, at most {EXPLAINED:.0%} was needed, and none of eight ways to turn or mirror the list "
-                "fits clearly. Check that its lines are in the photos' order"
-            ]
-        }
+        return [
+            f"the photos' shading contradicts the listed lights: it leaves {tested.misfit:.0%} of the brightness "
+            f"unexplained, at most {EXPLAINED:.0%} was needed, and none of eight ways to turn or mirror the list fits "
+            "clearly. Check that its lines are in the photos' order"
+        ]
     if way and way != 2 and (way // 4, way % 2) == (upright // 4, upright % 2):
         way = upright  # the tag tells which of the two
-    return {"warnings": [_sentence(tested, way, orientation)]} if way else {}
+    return [_sentence(tested, way, orientation)] if way else []
 
 
 def _sentence(tested: AxesTest, way: int, orientation: int) -> str:

@@ -5,22 +5,32 @@ distant_camera): x right, y up, z towards the camera, the unit a pixel. A calibr
 and unit. RTI's lists may name fewer photos than there are; any other file gives a light to each photo of one folder.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from calibration.calibration import Calibration, load_calibration
 from calibration.known_scene import KnownScene
 from calibration.light import Light
-from calibration.lights.files import GivenLights, is_calibration, is_text_list, read_lights
-from calibration.lights.layouts import text_rows
-from calibration.lights.photo_lists import folders_of, match, photos_in
+from calibration.lights.files import GivenLights, NoMatchError, is_calibration, is_number_list, read_lights
+from calibration.lights.number_lists import number_rows
+from calibration.lights.photo_lists import dark_photos, folders_of, match, photos_in
+from calibration.posed_camera import PosedCamera
 from calibration.scenes.distant_camera import distant_light, distant_scene, picture_camera
 from capture.decode.formats import read_size
-from capture.errors import CalibrationError, UserError
-from capture.files.json_field import read_text
+from capture.errors import CalibrationError, CaptureError
 
 MASK = "mask.png"
-KINDS = ("*.lp", "*/*.lp", "*.csv", "*.dome", "light*.json")  # not calibration.json, which only --lights names
+KINDS = (
+    "*.lp",
+    "*/*.lp",
+    "*.csv",
+    "*.dome",
+    "light*.json",
+    "light*.mat",
+)  # not calibration.json, which only --lights names
 
 
 @dataclass(frozen=True)
@@ -29,12 +39,21 @@ class ListedLights:
 
     given: Path | None = None  # by --lights
 
-    layout = "photos with a list of lights (.lp, .csv, .dome, lights.json)"
+    layout = "photos with a list of lights (.lp, .csv, .mat, .dome, lights.json)"
 
     def recognises(self, folder: Path) -> str | None:
-        """The file's name, if it gives a light to every photo: then none of them is the photo of a board."""
+        """The file's name, if it gives a light to every photo: then none of them is the photo of a board.
+
+        Raises:
+            CalibrationError: the user's file cannot be read; one that only lies there need not be of lights.
+        """
         beside = self._lists(folder)
-        return beside[0].name if len(beside) == 1 and _photos_of(folder, beside[0]) is not None else None
+        try:
+            return beside[0].name if len(beside) == 1 and _photos_of(folder, beside[0]) is not None else None
+        except CalibrationError:
+            if self.given is not None:
+                raise
+            return None
 
     def load(self, folder: Path, split: str) -> KnownScene:
         """As load_listed."""
@@ -51,8 +70,10 @@ def load_listed(folder: Path, source: Path) -> KnownScene:
     Raises:
         CalibrationError, CaptureError: the file is none of lights, or its lights fit no photos.
     """
-    if is_text_list(source):
-        return _of_directions(folder, source)
+    if is_number_list(source):
+        named = _of_rows(folder, source)
+        if named is not None:
+            return named
     photos = _photos_of(folder, source)
     if photos is None:
         stocks = [photos_in(place) for place in folders_of(folder)]
@@ -64,55 +85,84 @@ def load_listed(folder: Path, source: Path) -> KnownScene:
     note = f"lights: from {source.name}, for each of {len(photos)} photos and none of a board"
     if is_calibration(source):
         return _with_its_camera(photos, load_calibration(source), given, note)
-    lights = tuple(_in_front(light, source) for light in given.lights)
-    notes = (note, *given.notes, camera_note)
-    return distant_scene(photos, lights, posed_camera, photos[0].parent / MASK, notes, has_power=given.has_power)
+    lights = _in_front(given.lights, given.unit, posed_camera, source)
+    notes, dark = (note, *given.notes, camera_note), dark_photos(folder, photos)
+    mask = photos[0].parent / MASK
+    return distant_scene(photos, lights, posed_camera, mask, notes, has_power=given.has_power, dark=dark)
 
 
-def _of_directions(folder: Path, source: Path) -> KnownScene:
-    """Directions in a text file, which may name some of the photos only."""
+def _of_rows(folder: Path, source: Path) -> KnownScene | None:
+    """Return the scene of a list that may name some of the photos only; None for one without names."""
     beside = source.parent if source.resolve().is_relative_to(folder.resolve()) else folder
     folders = [beside, *(place for place in folders_of(folder) if place != beside)]
     first = next((photo for place in folders for photo in photos_in(place)[:1]), None)
     if first is None:
         raise CalibrationError(f"no photos found in {folder}; those whose lights {source} gives were needed.")
     posed_camera, camera_note = picture_camera(first)
-    rows = text_rows(read_text(source), source, posed_camera)
+    rows = number_rows(source, posed_camera)
+    if not any(rows.names):
+        return None
     photos, how = match(rows.names, folders, source)
-    lights = tuple(distant_light(path.name, towards) for path, towards in zip(photos, rows.values, strict=True))
-    found = f"lights: {len(lights)} directions from {source.name}, photos {how}"
-    return distant_scene(photos, lights, posed_camera, photos[0].parent / MASK, (found, camera_note))
+    lights = tuple(replace(light, photo=path.name) for path, light in zip(photos, rows.lights(), strict=True))
+    kind = "places" if rows.kind == "point" else "directions"
+    notes = (f"lights: {len(lights)} {kind} from {source.name}, photos {how}", rows.note, camera_note)
+    dark, mask = dark_photos(folder, photos), photos[0].parent / MASK
+    return distant_scene(
+        photos, _in_front(lights, rows.unit, posed_camera, source), posed_camera, mask, notes, dark=dark
+    )
 
 
 def _photos_of(folder: Path, source: Path) -> list[Path] | None:
-    """Return the photos of the first folder in which the file gives a light to every photo; None if there is none."""
+    """Return the photos of the first folder in which the file gives a light to every photo; None if there is none.
+
+    Raises:
+        CalibrationError: the file is none of lights.
+    """
     for place in folders_of(folder):
         photos = photos_in(place)
         try:
             posed_camera = picture_camera(photos[0])[0] if photos else None
             given = read_lights(source, [path.name for path in photos], posed_camera) if posed_camera else None
-        except UserError:
+        except (CaptureError, NoMatchError):
             continue
         if given is not None and not given.is_by_number:
             return photos
     return None
 
 
-def _in_front(light: Light, source: Path) -> Light:
-    """Return a light as distant_light does.
+def _in_front(lights: Sequence[Light], unit: str, posed_camera: PosedCamera, source: Path) -> tuple[Light, ...]:
+    """Return lights of the picture's frame as distant_light does.
 
     Raises:
-        CalibrationError: a point behind the picture's plane.
+        CalibrationError: places in millimetres, behind the picture or within what it shows; or all lights from behind.
     """
-    if light.direction is not None:
-        return replace(distant_light(light.photo, light.direction, light.power), sigma=light.sigma)
-    assert light.position is not None
-    if light.position[2] <= 0:
+    needed = (
+        "Directions were needed, or places in pixels from the middle of the picture: x right, y up, z to the camera"
+    )
+    if unit == "mm":
         raise CalibrationError(
-            f"{source} puts the light of {light.photo} at z = {light.position[2]:.4g}, behind the picture; a place "
-            "in front of it was needed: x right, y up, z towards the camera, in pixels from the middle of the picture."
+            f"{source} gives places in a unit of length, and no board tells how wide a pixel is. {needed}."
         )
-    return light
+    camera = posed_camera.camera
+    for light in lights:
+        if light.position is None:
+            continue
+        away = float(np.linalg.norm(light.position))
+        if light.position[2] <= 0 or away < min(camera.width, camera.height) / 2:
+            where = "behind the picture" if light.position[2] <= 0 else "within what the picture shows"
+            raise CalibrationError(
+                f"{source} puts the light of {light.photo} at z = {light.position[2]:.4g}, {away:.4g} pixels from the "
+                f"middle of the picture, {where}. {needed}; directions have length 1, or columns named dx, dy, dz."
+            )
+    found = tuple(
+        light
+        if light.direction is None
+        else replace(distant_light(light.photo, light.direction, light.power), sigma=light.sigma)
+        for light in lights
+    )
+    if not any(light.used for light in found):
+        raise CalibrationError(f"{source}: no light is in front of the picture ({found[0].reason}). {needed}.")
+    return found
 
 
 def _with_its_camera(photos: list[Path], own: Calibration, given: GivenLights, note: str) -> KnownScene:

@@ -1,8 +1,8 @@
 """Our own layout for scenes whose calibration is given: what `shadowgraph import` writes and every command reads.
 
 `import.json` (what was imported, and what the rest means), `calibration.json` as a run leaves it, the photos in
-`photos/`, shadow pictures in `shadows/`, both under the names of the lights' photos, and `mask.png`, white on the
-object.
+`photos/`, shadow pictures in `shadows/`, both under the names of the lights' photos, photos without light in
+`dark/`, and `mask.png`, white on the object.
 """
 
 import shutil
@@ -13,6 +13,7 @@ import numpy as np
 
 from calibration.calibration import load_calibration, save_calibration
 from calibration.known_scene import KnownScene
+from calibration.lights.photo_lists import DARK, photos_in
 from capture.errors import CalibrationError, CaptureError
 from capture.files.atomic import atomic_folder, write_json
 from capture.files.json_field import JsonField, read_object
@@ -61,6 +62,7 @@ class OwnScene:
             mask_is_grey=True,
             ground_known=document["ground_known"].flag(),
             is_linear=document["linear"].flag(),
+            dark_paths=tuple(photos_in(folder / DARK)),
             notes=tuple(note.text() for note in document["notes"].entries()),
         )
 
@@ -91,6 +93,9 @@ def _write(scene: KnownScene, layout: str, out: Path) -> None:
         for name, path in zip(names, paths or (), strict=bool(paths)):
             (out / place).mkdir(exist_ok=True)
             shutil.copyfile(path, out / place / name)
+    for path in scene.dark_paths:
+        (out / DARK).mkdir(exist_ok=True)
+        shutil.copyfile(path, out / DARK / path.name)
     if scene.mask_path is not None:
         mask = read_grey(scene.mask_path) if scene.mask_is_grey else read_alpha(scene.mask_path)
         if mask is not None:

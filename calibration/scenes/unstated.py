@@ -22,6 +22,7 @@ from calibration.lights.lambert import (
 )
 from capture.decode.formats import states_curve
 from capture.photos.photo import PhotoStack, read_stack, srgb_of
+from capture.photos.radiometry import without_ambient
 
 FEWEST = 8  # photos: three numbers per pixel and one per photo are fitted
 FEWEST_PIXELS = 100  # of the preview
@@ -52,7 +53,13 @@ class _Samples:
     pixels: Int[np.ndarray, " pixels"]  # of the preview
 
 
-def read_shading(photos: Sequence[Path], lights: Sequence[Light], is_linear: bool | None, has_power: bool) -> Shading:
+def read_shading(
+    photos: Sequence[Path],
+    lights: Sequence[Light],
+    is_linear: bool | None,
+    has_power: bool,
+    dark: Sequence[Path] = (),
+) -> Shading:
     """Return a preview of the photos, with the curve that nothing states and powers that no list gives.
 
     The curve is tested where neither the layout nor the file says it: of sRGB and linear numbers, the one under which
@@ -64,15 +71,16 @@ def read_shading(photos: Sequence[Path], lights: Sequence[Light], is_linear: boo
         lights: in the picture's frame, by photo name.
         is_linear: pixel values are linear (True) or sRGB (False); None: nothing is known.
         has_power: the list gives powers, or their ratios, which stay.
+        dark: photos without light, which are subtracted.
 
     Raises:
-        CaptureError: a photo cannot be read.
+        CaptureError: a photo cannot be read, or one without light does not fit the others.
     """
-    small = preview(photos, bool(is_linear))
+    small = _darkened(preview(photos, bool(is_linear)), dark, bool(is_linear))
     notes: tuple[str, ...] = ()
     is_clear = True
     if is_linear is None and not states_curve(photos[0]):
-        other = preview(photos, True)
+        other = _darkened(preview(photos, True), dark, True)
         linear = _samples(other, lights)
         encoded = None if linear is None else _samples(small, lights, linear.pixels)
         is_linear, is_clear, notes = _curve(encoded, linear, has_power)
@@ -81,7 +89,9 @@ def read_shading(photos: Sequence[Path], lights: Sequence[Light], is_linear: boo
     samples = None if has_power or not is_clear else _samples(small, lights)
     if samples is None or _different_powers(samples) is None:
         return known
-    whole = small if len(small.paths) == len(photos) else read_stack(photos, LONG_SIDE, as_linear=bool(is_linear))
+    whole = small
+    if len(small.paths) < len(photos):
+        whole = _darkened(read_stack(photos, LONG_SIDE, as_linear=bool(is_linear)), dark, bool(is_linear))
     samples = _samples(whole, lights)
     found = None if samples is None else _different_powers(samples)
     if samples is None or found is None:
@@ -94,6 +104,13 @@ def read_shading(photos: Sequence[Path], lights: Sequence[Light], is_linear: boo
     )
     powered = tuple(replace(light, power=light.power * power.get(light.photo, 1.0)) for light in lights)
     return replace(known, lights=powered, notes=(*notes, note))
+
+
+def _darkened(stack: PhotoStack, dark: Sequence[Path], is_linear: bool) -> PhotoStack:
+    """Return a preview without the light of its dark photos."""
+    if not dark:
+        return stack
+    return without_ambient(stack, read_stack(dark, LONG_SIDE, stack.reference, as_linear=is_linear))
 
 
 def _samples(

@@ -1,4 +1,4 @@
-"""Read arrays from untrusted .npy and .npz files: only plain numbers of the stated size are accepted.
+"""Read arrays from untrusted .npy, .npz and .mat files: only plain numbers of the stated size are accepted.
 
 Nothing in the files is executed, and no memory is allocated before header and size agree.
 """
@@ -18,6 +18,8 @@ from capture.errors import CalibrationError
 from capture.files.regular import why
 
 LARGEST_FILE = 64 * 2**20  # bytes, unpacked: a hundred thousand lights, or a depth map of eight megapixels
+MAT_HEAD, MAT_PACKED = 128, 15  # bytes before the parts of a MATLAB file, and the kind of a packed one
+MAT_NUMBERS = ("double", "single", "int", "uint", "logical")  # kinds of its arrays
 NUMBERS = "fiub"  # kinds of numpy dtypes: floats, integers, booleans
 _DAMAGED = (
     *(OSError, ValueError, EOFError, KeyError, TypeError, SyntaxError, OverflowError, RuntimeError),
@@ -59,6 +61,56 @@ def read_npz(path: Path, names: tuple[str, ...], largest: int = LARGEST_FILE) ->
             return {name: _numbers(_unpacked(packed, found[name])) for name in names}
     except _DAMAGED as error:
         raise CalibrationError(f"{path} cannot be read ({why(error)}); {', '.join(names)} were needed.") from error
+
+
+def read_mat(path: Path, largest: int = LARGEST_FILE) -> dict[str, Float[np.ndarray, "..."]]:
+    """Return the arrays of numbers in a MATLAB file (version 4 to 7) as float64, by name; no objects, cells or text.
+
+    Raises:
+        CalibrationError: the file cannot be read, is of version 7.3 (HDF5), or unpacks to more than `largest` bytes.
+    """
+    import scipy.io  # takes a while, and few need it
+
+    try:
+        if path.stat().st_size > largest:
+            raise _too_large(path, largest)
+        file = io.BytesIO(_parts_of_mat(path, largest))
+        names = [
+            name
+            for name, shape, kind in scipy.io.whosmat(file)
+            if kind.startswith(MAT_NUMBERS) and math.prod(shape) * 8 <= largest
+        ]
+        content = scipy.io.loadmat(file, variable_names=names)
+        return {name: np.asarray(content[name], dtype=float) for name in names}
+    except NotImplementedError as error:
+        raise CalibrationError(
+            f"{path} is of MATLAB's version 7.3 (HDF5), which is not read. Save it with save(..., '-v7')."
+        ) from error
+    except (*_DAMAGED, IndexError, scipy.io.matlab.MatReadError) as error:
+        raise CalibrationError(f"{path} cannot be read as MATLAB's file ({why(error)}).") from error
+
+
+def _parts_of_mat(path: Path, largest: int) -> bytes:
+    """Return the bytes of a MATLAB file with its packed parts unpacked: so none fills more memory than was checked.
+
+    Raises:
+        CalibrationError: they unpack to more than `largest` bytes.
+    """
+    data = path.read_bytes()
+    order = {b"\0\1IM": "little", b"\1\0MI": "big"}.get(data[124:MAT_HEAD])
+    if order is None:
+        return data  # of version 4, which packs nothing, or of 7.3
+    parts, at, size = [data[:MAT_HEAD]], MAT_HEAD, MAT_HEAD
+    while at + 8 <= len(data):
+        kind, length = (int.from_bytes(data[at + k : at + k + 4], order) for k in (0, 4))
+        part = data[at : at + 8 + length]
+        if kind == MAT_PACKED:
+            part = zlib.decompressobj().decompress(part[8:], largest)
+        parts.append(part)
+        size, at = size + len(part), at + 8 + length
+        if size >= largest:
+            raise _too_large(path, largest)
+    return b"".join(parts)
 
 
 def _unpacked(packed: zipfile.ZipFile, part: zipfile.ZipInfo) -> bytes:

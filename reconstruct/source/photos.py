@@ -132,6 +132,9 @@ def _photos_of_scene(known: KnownScene, options: RunOptions, kept: Path | None, 
     stack = None
     if wants_rgb and known.rgb_paths is not None:
         stack = read_stack(known.rgb_paths, options.long_side(), as_linear=known.is_linear, kept=kept)
+        if known.dark_paths:
+            dark = read_stack(known.dark_paths, options.long_side(), stack.reference, known.is_linear)
+            stack = without_ambient(stack, dark)
     path = known.ground_depth_path if options.ground == AUTO else None
     ground_depth = None if path is None else read_ground_depth(path, known.calibration.camera)
     return Photos(stack, shadow=shadow, mask=mask, ground_depth=ground_depth, plan=plan)

@@ -30,6 +30,7 @@ DESCRIPTIONS = (
     "*.lp",
     "*/*.lp",
     "*.csv",
+    "light*.mat",
     "*.dome",
     "session.toml",
 )  # files that may describe a known scene
@@ -81,7 +82,14 @@ class Source:
         mask = [self.known.mask_path] if self.known.mask_path else []
         texts = sorted(path for kind in DESCRIPTIONS for path in self.folder.glob(kind))
         uneven = [self.known.ground_depth_path] if self.known.ground_depth_path else []
-        return [*texts, *uneven, *(self.known.rgb_paths or ()), *(self.known.shadow_paths or ()), *mask]
+        return [
+            *texts,
+            *uneven,
+            *(self.known.rgb_paths or ()),
+            *(self.known.shadow_paths or ()),
+            *self.known.dark_paths,
+            *mask,
+        ]
 
     def ground_is_known(self, options: RunOptions) -> bool:
         """Return True if the ground plane is given, by --ground or by the folder itself."""
@@ -155,7 +163,10 @@ def _opened(folder: Path, options: RunOptions, lights: Path | None) -> Source:
         return Source(folder, known=load_with_ball(folder, circle))
     try:
         capture = load_capture(folder)
-        ball = load_with_ball(folder, None) if _may_lack_a_board(capture, options) else None
+        is_bare = _may_lack_a_board(capture, options)
+        if is_bare and lights is not None:
+            raise NoBoardError(f"no photo in {folder} shows a board that others show too.")
+        ball = load_with_ball(folder, None) if is_bare else None
         return Source(folder, capture=capture) if ball is None else Source(folder, known=ball)
     except NoBoardError as no_capture:
         if lights is None:
@@ -178,7 +189,7 @@ def _may_lack_a_board(capture: Capture, options: RunOptions) -> bool:
     if len(capture.sessions()) > 1 or not session.board:
         return False
     is_named = options.board or session.settings.board or any(role == "board" for role, _ in session.settings.roles)
-    if is_named or options.lights != WAYS[0] or session.board[0].parent != session.folder or clip_of(session.board[0]):
+    if is_named or options.lights in WAYS[1:] or session.board[0].parent != session.folder or clip_of(session.board[0]):
         return False
     return guess_board([grey_of(read_photo(path)) for path in session.board]) is None
 
