@@ -53,7 +53,9 @@ def test_photos_without_light_are_subtracted(tmp_path, layout):
     stack = read_photos(source, options).stack
     assert stack is not None and np.abs(stack.rgb - clean).max() < 0.01
     assert {dark / "a.png", dark / "b.png"} <= set(source.files(options))
-    assert source.known is not None and any("2 photos in dark/ are subtracted" in note for note in source.known.notes)
+    assert source.known is not None and any(
+        "the mean of dark/ (2) is subtracted" in note for note in source.known.notes
+    )
     import_folder(tmp_path / "theirs", "train", tmp_path / "ours")
     again = read_photos(open_source(tmp_path / "ours", options), options).stack
     assert again is not None and np.array_equal(again.rgb, stack.rgb)

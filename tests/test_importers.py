@@ -419,6 +419,25 @@ def test_a_file_that_the_user_names_is_the_one_that_is_refused(tmp_path, name, c
     assert str(file) in said and "board in" not in said and ("Lights are read from" in said or "needed" in said)
 
 
+@pytest.mark.parametrize("name", ["some.lp", "some.csv", "foreign.lp"])
+def test_photos_in_room_light_beside_listed_ones_need_no_board(tmp_path, name):
+    """What only looks like the board's photo shows none: the list decides, and is named where it fits no photos."""
+    truth = seen_from_above(HEAP, side=64, n_lights=8)
+    lines = write_rti(tmp_path / "theirs", truth)[1:]
+    capture = tmp_path / "capture"
+    (tmp_path / "theirs" / "jpeg-exports").rename(capture)
+    write_photo(capture / "room.png", truth.stack.rgb.mean(0) * 0.8)
+    file = tmp_path / name
+    file.write_text("\n".join(",".join(x.split()) if "csv" in name else x for x in lines).replace("jpg", "png"))
+    if name == "foreign.lp":
+        file.write_text(file.read_text().replace("stone", "bust"))
+        with pytest.raises(CaptureError, match=r"foreign.lp lists 8 lights and .* holds 9 photos"):
+            open_source(capture, RunOptions(lights=str(file)))
+        return
+    known = open_source(capture, RunOptions(lights=str(file))).known
+    assert known is not None and len(known.rgb_paths or ()) == 8
+
+
 def test_places_in_pixels_are_lights_of_photos_without_a_board(tmp_path):
     truth = seen_from_above(side=32, n_lights=6)
     write_rti(tmp_path / "theirs", truth)

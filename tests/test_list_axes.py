@@ -45,13 +45,13 @@ def photos_of(height):
     return [0.8 * np.clip(normals @ light, 0, None) * is_lit for light in lights()]
 
 
-def write(folder, height, listed, turned=None):
+def write(folder, height, listed, turned=None, power=None):
     """A folder with a list; `turned` stores the pictures turned for EXIF orientation of that number."""
     folder.mkdir(exist_ok=True)
     lines = []
     for i, (grey, towards) in enumerate(zip(photos_of(height), listed, strict=True)):
         name = f"{i:02d}.{'png' if turned is None else 'jpg'}"
-        rgb = np.repeat(grey[..., None], 3, -1)
+        rgb = np.repeat(grey[..., None], 3, -1) * (1 if power is None else power[i])
         if turned is None:
             write_photo(folder / name, rgb)
         else:
@@ -99,6 +99,17 @@ def test_the_way_that_a_list_fits_is_said_with_the_figures(tmp_path, height, way
     assert f"'{ROWS[way]}'" in sentence and "Nothing was changed" in sentence
     if height is egg:
         assert f"Write '{ROWS[way]}' for x y z" in sentence
+
+
+@pytest.mark.parametrize("way", [0, 1, 4, 7])
+def test_places_are_tried_by_the_way_to_them(tmp_path, way):
+    far = 40 * SIDE * np.linspace(0.7, 1.3, PHOTOS)
+    places = listed_so_that(way) * far[:, None]
+    write(tmp_path, egg, places, power=1 / (far / far.max()) ** 2 * 0.2)
+    lines = (tmp_path / "lights.lp").read_text().splitlines()[1:]
+    (tmp_path / "lights.csv").write_text("\n".join(["photo,x,y,z", *(line.replace(" ", ",") for line in lines)]))
+    (tmp_path / "lights.lp").unlink()
+    assert [f"'{ROWS[way]}' for x y z" in text for text in warnings_of(tmp_path)] == [True] * bool(way)
 
 
 @pytest.mark.parametrize("orientation", [2, 3, 4, 5, 6, 7, 8])

@@ -126,7 +126,7 @@ def distant_scene(
             f"lights: the list is read over the photos as stored, EXIF orientation {orientation} not applied",
         )
     if dark:
-        notes = (*notes, f"room light: {len(dark)} photos in {dark[0].parent.name}/ are subtracted from the others")
+        notes = (*notes, f"room light: the mean of {dark[0].parent.name}/ ({len(dark)}) is subtracted from the photos")
     residuals = {"warnings": [*unused, *judged(small, lights, orientation)]}
     calibration = Calibration.of(posed_camera, lights, unit="scene", residuals=residuals)
     return KnownScene(

@@ -15,6 +15,7 @@ from calibration.calibration import Calibration, load_calibration
 from calibration.known_scene import KnownScene
 from calibration.light import Light
 from calibration.lights.files import GivenLights, NoMatchError, is_calibration, is_number_list, read_lights
+from calibration.lights.layouts import view_note
 from calibration.lights.number_lists import number_rows
 from calibration.lights.photo_lists import dark_photos, folders_of, match, photos_in
 from calibration.posed_camera import PosedCamera
@@ -105,7 +106,8 @@ def _of_rows(folder: Path, source: Path) -> KnownScene | None:
     photos, how = match(rows.names, folders, source)
     lights = tuple(replace(light, photo=path.name) for path, light in zip(photos, rows.lights(), strict=True))
     kind = "places" if rows.kind == "point" else "directions"
-    notes = (f"lights: {len(lights)} {kind} from {source.name}, photos {how}", rows.note, camera_note)
+    how_read = () if rows.note == view_note(posed_camera) else (rows.note,)
+    notes = (f"lights: {len(lights)} {kind} from {source.name}, photos {how}", *how_read, camera_note)
     dark, mask = dark_photos(folder, photos), photos[0].parent / MASK
     return distant_scene(
         photos, _in_front(lights, rows.unit, posed_camera, source), posed_camera, mask, notes, dark=dark
