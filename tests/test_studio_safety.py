@@ -1,10 +1,14 @@
 """Nobody but the owner, and phones that were let in, reaches the studio; nothing leads outside its folder."""
 
 import http.client
+import itertools
+import json
+import os
 import re
 import ssl
 import time
 from pathlib import Path
+from urllib.parse import quote
 
 import psutil
 import pytest
@@ -15,6 +19,8 @@ from waiting import wait_until
 
 from viewer.studio import sockets
 from viewer.studio_server import gate, phones
+from viewer.studio_server.phone_routes import PhoneRoutes
+from viewer.studio_server.routes import owner_app
 from viewer.studio_server.web_files import WEB
 
 LOCAL_STYLE = re.compile(r"\bstyle\s*=|<style|javascript:|\bon\w+\s*=\s*[\"']", re.IGNORECASE)
@@ -114,6 +120,61 @@ def test_keys_of_strangers_lead_nowhere(open_studio, key):
     assert sorted(path for path in studio.folder.root.rglob("*") if ".studio" not in path.parts) == before
 
 
+STRANGE = {
+    "long": "a" * 5000,
+    "longer than a name": "a" * 300,
+    "bytes that are no text": "\udcff",
+    "half a letter": "\ud800",
+    "nothing": "\0",
+    "lines": "a\r\nb: c\u2028",
+    "backwards": "\u202egpj.a",
+    "up": "../" * 50,
+    "a number": 3,
+    "a list": [["a"]],
+    "an object": {"a": {}},
+    "none": None,
+}
+NAMES = ("key", "title", "photo", "part", "id", "board", "role", "preset", "job", "action", "format", "size", "paper")
+NAMES += ("token", "name", "capture")
+
+
+@pytest.mark.parametrize("value", STRANGE.values(), ids=list(STRANGE))
+def test_no_value_of_a_request_is_a_fault_of_the_program_at_any_address(let_in, open_studio, value):
+    """Every route there is, with every name that one of them reads."""
+    door, owner, port, token = let_in
+    phone = joined(port, token)
+    studio = open_studio[0]
+    everybody = (phone, PhoneRoutes(studio).app(door)._app), (owner, owner_app(studio, door))
+    words = quote(str(value), errors="surrogateescape" if value == "\udcff" else "surrogatepass")
+    query = "&".join(f"{name}={words}" for name in NAMES)
+    headers = {"Upload-Length": words, "Upload-Metadata": f"filename {words}", "Upload-Offset": words}
+    bodies = [json.dumps(dict.fromkeys(NAMES, value))]
+    bodies += [json.dumps(dict.fromkeys(NAMES, "x") | {name: value}) for name in ("key", "title", "token", "name")]
+    for client, app in everybody:
+        for route in app.routes:
+            address = re.sub(r"\{[^}]*\}", words, route.path) + f"?{query}"
+            if route.path not in ("/api/leave", "/api/send_away"):  # after which all others would be refused
+                for method, body in itertools.product(route.methods - {"HEAD"} or {"HEAD"}, bodies):
+                    answer = client.raw(method, address, body.encode() if method in ("POST", "PUT") else b"", **headers)
+                    assert answer.status < 500, (method, route.path, answer.content[:300])
+    assert owner.get("/api/state")[0] == 200
+
+
+@pytest.mark.parametrize("name", [b"\xff\xfe", b"caf\xe9", b"\xed\xa0\x80"])
+def test_names_that_are_no_text_hold_nothing_up(tmp_path, name):
+    capture_in(tmp_path, "vase")
+    (tmp_path / "vase" / os.fsdecode(name + b".jpg")).write_bytes(jpeg(1))
+    (tmp_path / os.fsdecode(name)).mkdir()
+    (tmp_path / os.fsdecode(name) / "a.jpg").write_bytes(jpeg(2))
+    (tmp_path / "captures").mkdir()
+    (tmp_path / "captures" / os.fsdecode(name)).mkdir()
+    with served(tmp_path) as (studio, _, owner):
+        assert [card["key"] for card in owner.get("/api/state")[1]["cards"]] == ["vase"]
+        assert owner.get("/api/capture?key=vase")[0] == 200
+        assert owner.get("/api/folders?key=")[0] == 200
+        studio.checks.tick()
+
+
 def test_uploads_are_held_to_their_size_and_their_id(open_studio):
     _, _, owner = open_studio
     assert owner.create("vase", "a.jpg", 10**15).status == 400
@@ -144,8 +205,8 @@ def _answers(port: int) -> bool:
         return False
 
 
-def joined(port: int, token: str) -> Client:
-    answer = Client(port).raw("POST", "/join", f'{{"token": "{token}", "name": "Pixel"}}'.encode())
+def joined(port: int, token: str, name: str = "Pixel") -> Client:
+    answer = Client(port).raw("POST", "/join", f'{{"token": "{token}", "name": "{name}"}}'.encode())
     assert answer.status == 200, answer.content
     return Client(port, answer.headers["Set-Cookie"].partition(";")[0])
 
@@ -174,6 +235,24 @@ def test_a_phone_sends_to_the_capture_of_its_door_alone_and_reaches_nothing_else
     assert phone.raw("POST", "/api/delete", b'{"key": "vase"}').status in (404, 405)
     assert phone.raw("POST", "/upload", b"", Origin="http://evil.example").status == 403
     assert Client(owner.port, phone.cookie).raw("GET", "/api/state").status == 401
+
+
+@pytest.mark.parametrize(
+    "who", ["owner", "another phone", "a phone of the same name", "a phone that calls itself owner"]
+)
+def test_a_file_under_way_is_changed_by_its_sender_alone(let_in, who):
+    door, owner, port, token = let_in
+    phone = joined(port, token)
+    name = {"another phone": "Nokia", "a phone named owner": "owner"}.get(who, "Pixel")
+    other = owner if who == "owner" else joined(port, door.door.token, name)
+    for sender, stranger in ((phone, other), (other, phone)):
+        photo = jpeg(13)
+        address = sender.create("vase", "mine.jpg", len(photo)).headers["Location"]
+        assert sender.piece(address, 0, photo[:9]).status == 204
+        assert stranger.raw("HEAD", address).status == stranger.piece(address, 9, photo[9:]).status == 404
+        assert stranger.raw("DELETE", address).status in (204, 404)
+        assert sender.raw("HEAD", address).headers["Upload-Offset"] == "9"
+        assert sender.raw("DELETE", address).status == 204 and sender.raw("HEAD", address).status == 404
 
 
 def test_a_full_disk_is_a_sentence_to_a_phone_whose_file_goes_on_once_there_is_room(let_in, open_studio):

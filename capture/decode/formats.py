@@ -19,7 +19,7 @@ from capture.decode.sandbox import DAMAGED
 from capture.decode.tiff import opencv_channels, read_tiff, read_tiff_alpha
 from capture.decode.video import read_clip, read_frame
 from capture.errors import CaptureError
-from capture.files.names import clip_of
+from capture.files.names import clip_of, is_shown
 
 LARGEST_WHOLE = 65_000_000  # pixels: a photo takes 13 bytes for each, and its processing as much again
 STRIP_ROWS = 256  # of a picture that is copied piece by piece
@@ -45,8 +45,8 @@ class DecodedPhoto:
 
 
 def is_photo_name(path: Path) -> bool:
-    """Return whether a name has the suffix of a photo and is not hidden."""
-    return path.suffix.lower() in _SUFFIXES | _RAW_SUFFIXES and not path.name.startswith(".")
+    """Return whether a name has the suffix of a photo and is shown."""
+    return path.suffix.lower() in _SUFFIXES | _RAW_SUFFIXES and is_shown(path)
 
 
 def format_of(path: Path) -> str:

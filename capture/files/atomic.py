@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from capture.files.regular import read_regular
 
 READABLE = 0o644
 TEMPORARY = ".part"  # in the name of every unfinished file
+_HALF_LETTER = re.compile(r"\\u[dD][89a-fA-F]")  # in JSON: fine if its other half follows
 
 
 @contextmanager
@@ -79,10 +81,13 @@ def parse_json(text: str) -> Any:
     """Parse JSON text.
 
     Raises:
-        ValueError: it is not JSON, or nested too deeply.
+        ValueError: it is not JSON, nested too deeply, or holds half of a letter, which nothing can write again.
     """
     try:
-        return json.loads(text)
+        found = json.loads(text)
+        if _HALF_LETTER.search(text):
+            json.dumps(found, ensure_ascii=False).encode()
+        return found
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
 

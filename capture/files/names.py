@@ -84,9 +84,14 @@ def natural_order(path: Path) -> list[tuple[int, str]]:
     return [(int(part) if k % 2 else 0, part) for k, part in enumerate(parts)]
 
 
+def is_shown(path: Path) -> bool:
+    """Return whether a name is not hidden, and text: one of other bytes cannot be printed, sent or written down."""
+    return not path.name.startswith(".") and not any("\ud800" <= letter <= "\udfff" for letter in path.name)
+
+
 def is_clip_name(path: Path) -> bool:
-    """Return whether a name has the suffix of a clip and is not hidden."""
-    return path.suffix.lower() in CLIP_SUFFIXES and not path.name.startswith(".")
+    """Return whether a name has the suffix of a clip and is shown."""
+    return path.suffix.lower() in CLIP_SUFFIXES and is_shown(path)
 
 
 def frame_path(clip: Path, time_s: float) -> Path:

@@ -57,7 +57,7 @@ class Part:
     name: str  # as the sender gave it, with folders
     size: int  # bytes
     role: str = ""
-    sender: str = ""
+    sender: str = ""  # who alone may go on with it
     began: float = 0.0  # seconds since 1970
     arrived: tuple[str, ...] = ()  # where it is now, relative to its capture; several of an archive
     remarks: tuple[str, ...] = ()  # what was not taken of it

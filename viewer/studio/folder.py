@@ -7,6 +7,7 @@ from pathlib import Path
 from capture.errors import CaptureError, UserError
 from capture.files.atomic import read_json, write_json
 from capture.files.json_field import JsonField
+from capture.files.names import is_shown
 from capture.files.regular import is_own_folder
 from capture.files.title import as_name, keep_title
 from reconstruct.run.batch import looks_like_capture
@@ -182,12 +183,14 @@ class StudioFolder:
         return self.key(path)
 
     def _below(self, key: str) -> Path:
-        hidden = "\0" in key or any(part.startswith(".") for part in Path(key).parts)
-        path = self.root if hidden else (self.root / key).resolve()
-        if hidden or not path.is_relative_to(self.root) or not path.is_dir():
-            raise CaptureError(f"{key[:80]!r} is no folder below {self.root}; only those can be chosen.")
-        if len(path.relative_to(self.root).parts) > DEEPEST:
+        path, names = self.root, Path(key).parts
+        if len(names) > DEEPEST:
             raise CaptureError(f"{key[:80]!r} lies more than {DEEPEST} levels below {self.root}. Move it up.")
+        for name in names:
+            found = {folder.name: folder for folder in self._folders(path)}
+            if name not in found:
+                raise CaptureError(f"{key[:80]!r} is no folder below {self.root}; only those can be chosen.")
+            path = found[name]
         return path
 
     def _added(self) -> list[Path]:
@@ -203,7 +206,7 @@ class StudioFolder:
     def _folders(self, place: Path) -> list[Path]:
         """Return the folders in a place that are not hidden and do not lead outside, at most MOST_FOLDERS."""
         try:
-            found = sorted(path for path in place.iterdir() if not path.name.startswith(".") and path.is_dir())
+            found = sorted(path for path in place.iterdir() if is_shown(path) and path.is_dir())
         except OSError:
             return []
         return [path for path in found[:MOST_FOLDERS] if path.resolve().is_relative_to(self.root)]

@@ -39,7 +39,7 @@ class PhoneRoutes:
             Route("/api/state", self.state, methods=["GET"]),
             Route("/api/role", self.role, methods=["POST"]),
             Route("/api/leave", self.leave, methods=["POST"]),
-            *Uploads(self._studio.parts, self._target, lambda request: self._mine(request).name).routes(),
+            *Uploads(self._studio.parts, self._target, lambda request: self._mine(request).id).routes(),
         ]
         return Gate(
             Starlette(routes=routes, exception_handlers=sentences(self._studio.folder.root)), EVERYWHERE, self._admits

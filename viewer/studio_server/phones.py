@@ -5,6 +5,7 @@ the page the next code. Both end with the switch, or two hours after it was turn
 the same listeners again, so that what phones were sending goes on.
 """
 
+import hashlib
 import io
 import secrets
 import socket
@@ -44,6 +45,11 @@ class Phone:
     role: str = ""  # "camera" | "light" in live mode
     joined: float = 0.0  # seconds since 1970
     seen: float = 0.0
+
+    @property
+    def id(self) -> str:
+        """Who it is, without its secret: names may be alike."""
+        return hashlib.sha256(self.secret.encode()).hexdigest()[:32]
 
 
 @dataclass

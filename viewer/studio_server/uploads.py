@@ -27,7 +27,7 @@ class Uploads:
     """Answers the requests about files under way."""
 
     def __init__(self, parts: Parts, target: Target, sender: Callable[[Request], str]):
-        """`target` and `sender` (who sends, by name) raise a CaptureError for a request that may not send."""
+        """`target` and `sender` (who sends: another text for each) raise a CaptureError for who may not send."""
         self._parts, self._target, self._sender = parts, target, sender
 
     def routes(self) -> list[Route]:
@@ -84,12 +84,13 @@ class Uploads:
         return await to_thread.run_sync(self._parts.finish, part) if is_whole else part
 
     def _part(self, request: Request) -> Part | None:
+        """The file that an address names; None: there is none, or somebody else sends it."""
+        sender = self._sender(request)
         try:
             part = self._parts.find(request.path_params["id"])
         except KeyError:
             return None
-        self._sender(request)
-        return part
+        return part if part.sender == sender else None
 
     def _where(self, part: Part) -> dict[str, str]:
         found = {"Upload-Offset": str(self._parts.offset(part))}
