@@ -9,6 +9,7 @@ from pathlib import Path
 from types import FrameType, TracebackType
 
 from capture.errors import UserError
+from capture.files.names import in_one_line
 
 
 class Terminated(KeyboardInterrupt):
@@ -43,8 +44,9 @@ def say_fault(kind: type[BaseException], error: BaseException, trace: TracebackT
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
     where = f" ({Path(trace.tb_frame.f_code.co_filename).name}, line {trace.tb_lineno})" if trace else ""
+    said = in_one_line(f"{kind.__name__}: {error}{where}")
     sys.stderr.write(
-        f"shadowgraph: a fault of the program: {kind.__name__}: {error}{where}. --debug shows more; `shadowgraph "
+        f"shadowgraph: a fault of the program: {said}. --debug shows more; `shadowgraph "
         "report RUN --bundle fault.zip` packs what a bug report needs. The same command continues from here.\n"
     )
 
@@ -52,7 +54,7 @@ def say_fault(kind: type[BaseException], error: BaseException, trace: TracebackT
 def sentence_for(error: Exception) -> str | None:
     """Say in one sentence what is wrong with the input or the machine; None: it is a fault of the program."""
     if isinstance(error, UserError):  # which may quote a stranger's file: nothing in it commands the terminal
-        return "".join(letter if letter.isprintable() else " " for letter in str(error))
+        return in_one_line(str(error))
     if isinstance(error, OSError):  # no room, no right to write, a drive that went away
         return (
             f"{error.filename or 'a file'}: {error.strerror or error}. Check that the place can be written to and has "

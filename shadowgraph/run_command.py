@@ -6,7 +6,9 @@ from dataclasses import fields
 from pathlib import Path
 
 from rich.console import Console
+from rich.text import Text
 
+from capture.files.names import in_one_line
 from reconstruct.run_folder.folder import RunFolder
 from shadowgraph.loading import loading
 from shadowgraph.options import Calibrate, Check, Run, settings_of
@@ -41,7 +43,7 @@ def run_stages(command: Calibrate, console: Console) -> None:
     display = Display(console)
     with ExitStack() as until_closed:
         with display.beating(opening := f"opening {command.capture}"):
-            with console.status(opening):
+            with console.status(Text(in_one_line(opening))):
                 source = open_source(command.capture, options)
                 with loading():
                     from reconstruct.run import pipeline  # after the refusals, which need none of what it imports
@@ -55,7 +57,7 @@ def run_stages(command: Calibrate, console: Console) -> None:
                         _write_report(run)
         _print_result(out, console)
         if mode != "keep":
-            console.print(f"Look at them: shadowgraph view {out}", markup=False)
+            print_lines(console, f"Look at them: shadowgraph view {out}")
 
 
 def check(command: Check, console: Console) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from capture.files.names import in_one_line
 from reconstruct.run_folder.folder import Progress as Step
 from reconstruct.run_folder.forecast import STAGE_NAMES, Forecast, left_text
 
@@ -33,7 +34,8 @@ class Display:
 
     def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic):
         """Draw on this console; `clock` tells seconds."""
-        columns = (TextColumn("{task.description}"), BarColumn(24), TextColumn("{task.fields[words]}"))
+        words = TextColumn("{task.fields[words]}", markup=False)
+        columns = (TextColumn("{task.description}"), BarColumn(24), words)
         self.console = console
         self.progress = Progress(*columns, TimeElapsedColumn(), console=console, disable=not console.is_terminal)
         self._task: TaskID | None = None
@@ -47,7 +49,7 @@ class Display:
         with self._one_at_a_time:
             is_new = step.stage != self._step.stage
             self._forecast.see(asdict(step))
-            self._step, self._doing = step, step.message
+            self._step, self._doing = step, in_one_line(step.message)
             self._since = self._stepped = self._clock()
             if not self.progress.disable:
                 self._draw()
@@ -57,7 +59,7 @@ class Display:
     def activity(self, sentence: str) -> None:
         """Show what is done until the next step; an empty sentence: the run waits, and nothing is to be said."""
         with self._one_at_a_time:
-            self._doing, self._since = sentence, self._clock()
+            self._doing, self._since = in_one_line(sentence), self._clock()
             self._draw()
 
     def beat(self) -> None:
@@ -122,9 +124,9 @@ def _call_until(beat: Callable[[], None], ended: threading.Event) -> None:
 
 
 def print_lines(console: Console, *lines: str) -> None:
-    """Print lines as they are: nothing in them is markup, and none is broken."""
+    """Print lines as they are: nothing in them is markup, none is broken, and no name in them breaks one."""
     for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.print(in_one_line(line), markup=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager
@@ -140,7 +142,8 @@ def page(run_dir: Path, mode: str, console: Console) -> Iterator[None]:
     context = multiprocessing.get_context("spawn")
     receive, send = context.Pipe(duplex=False)
     process = context.Process(target=_serve, args=(run_dir, send), daemon=True)
-    process.start()
+    with _without_ctrl_c():
+        process.start()
     send.close()
     reader = threading.Thread(target=_print_addresses, args=(receive, console), daemon=True)
     reader.start()
@@ -154,6 +157,19 @@ def page(run_dir: Path, mode: str, console: Console) -> Iterator[None]:
     finally:
         process.terminate()
         process.join()
+
+
+@contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """Let processes that are started in this block take no notice of Ctrl-C: whoever started them ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _serve(run_dir: Path, send: Any) -> None:

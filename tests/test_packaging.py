@@ -72,7 +72,7 @@ def test_the_wheel_is_plain_python(wheel_names):
 
 def test_the_command_is_installed():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["scripts"] == {"shadowgraph": "shadowgraph.command:main"}
+    assert project["scripts"] == {"shadowgraph": "shadowgraph.__main__:start"}
 
 
 def test_the_first_screen_of_the_readme_shows_the_two_commands():

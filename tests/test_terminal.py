@@ -1,14 +1,23 @@
 """What the terminal says while a run works: where no bar can be drawn, a line at least every few seconds."""
 
 import io
+import signal
+import subprocess
+import sys
 import threading
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 from rich.console import Console
+from waiting import PATIENCE_S
 
+from capture.errors import CaptureError
 from reconstruct.run_folder.folder import Progress, RunFolder, read_log
-from shadowgraph.terminal import LINE_EVERY_S, Display
+from shadowgraph.faults import sentence_for
+from shadowgraph.terminal import LINE_EVERY_S, Display, print_lines
+
+ROOT = Path(__file__).parent.parent
 
 
 class Screen:
@@ -100,3 +109,65 @@ def test_an_activity_is_shown_but_is_no_step_of_the_run(tmp_path, sentence):
         assert read_log(tmp_path / "run" / "log.jsonl") == before
         assert len(steps) == len(before)
     assert shown == [sentence]
+
+
+@pytest.mark.parametrize("name", ["a\nb", "a\r\x1b[2Jb", "a\u202eb", "a\u2028b", "a\x07\x9bb", "[/x]b", "[red]b\t"])
+def test_no_name_of_a_file_breaks_a_line_or_commands_the_terminal(name):
+    shown = "".join(letter if letter.isprintable() else " " for letter in name)
+    for is_terminal in (False, True):
+        text = io.StringIO()
+        console = Console(file=text, force_terminal=is_terminal, color_system=None, width=200)
+        display = Display(console)
+        with display.progress:
+            display(step(0, name))
+            display.activity(f"reading {name}")
+        print_lines(console, name, sentence_for(CaptureError(name)) or "")
+        lines = [line.rstrip() for line in text.getvalue().replace("\x1b[?25h", "").splitlines()]
+        assert lines[-2:] == [shown.rstrip(), shown.rstrip()]
+        if is_terminal:
+            assert f"reading {shown}" in lines[-3]
+        else:
+            assert len(lines) == 3 and lines[0].endswith(f": 0 of 60, {shown}".rstrip())
+
+
+@pytest.mark.parametrize("place", ["loading", "working", "cleaning", "ending"])
+def test_ctrl_c_prints_no_traceback_wherever_it_arrives_and_a_second_one_ends_at_once(place):
+    code = f"""
+import atexit, signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.argv = ["shadowgraph", "doctor"]
+
+def wait(place):
+    if place == {place!r}:
+        print("here", flush=True)
+        time.sleep({PATIENCE_S})
+
+class Loader:
+    def find_spec(self, name, *_):
+        if name == "shadowgraph.command":
+            wait("loading")
+
+def execute(*_):
+    try:
+        wait("working")
+        if {place!r} == "cleaning":
+            raise KeyboardInterrupt
+    finally:
+        wait("cleaning")
+
+sys.meta_path.insert(0, Loader())
+atexit.register(wait, "ending")
+from shadowgraph.__main__ import start
+if {place!r} != "loading":
+    import shadowgraph.command
+    shadowgraph.command.execute = execute
+sys.exit(start())
+"""
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None and process.stdout.readline() == "here\n"
+    for _ in range(2):
+        process.send_signal(signal.SIGINT)
+    error = process.communicate(timeout=PATIENCE_S)[1]
+    assert "Traceback" not in error and process.returncode in (130, -signal.SIGINT)

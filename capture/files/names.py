@@ -78,6 +78,11 @@ def similar_folder(path: Path) -> Path | None:
     return here
 
 
+def in_one_line(text: str) -> str:
+    """Return a text that may hold strangers' names, with nothing left in it that breaks or turns a line."""
+    return "".join(letter if letter.isprintable() else " " for letter in text)
+
+
 def natural_order(path: Path) -> list[tuple[int, str]]:
     """Return a sort key in which the digits of a name count as numbers."""
     parts = re.split(r"([0-9]+)", path.name)  # every second part is digits

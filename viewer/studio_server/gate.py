@@ -17,6 +17,7 @@ from websockets.datastructures import Headers
 
 from capture.errors import UserError
 from capture.files.atomic import parse_json
+from capture.files.names import in_one_line
 from viewer.page.guard import COOKIE, is_own_page, is_same
 from viewer.studio.page_words import in_page_words, without_folder
 
@@ -151,5 +152,4 @@ def _as_sentence(root: Path, _request: Request, error: Exception) -> Response:
         status = 507 if is_full else 500
         hint = "Empty the trash, or make room." if is_full else "Try again; check that the folder can be written to."
         text = f"{error.strerror or error}. {hint}"
-    shown = "".join(letter if letter.isprintable() else " " for letter in text)
-    return JSONResponse({"error": shown[:2000]}, status)
+    return JSONResponse({"error": in_one_line(text)[:2000]}, status)

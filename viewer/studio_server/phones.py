@@ -24,6 +24,7 @@ from starlette.types import ASGIApp
 from capture.errors import CaptureError, UserError
 from capture.files.atomic import read_json, write_json
 from capture.files.json_field import JsonField
+from capture.files.names import in_one_line
 from viewer.studio.sockets import free_socket, http_server
 from viewer.studio_server.certificate import make_certificate
 
@@ -127,7 +128,7 @@ class Phones:
                 raise CaptureError("This code was used already, or is over. Scan the new code that the studio shows.")
             if len(door.phones) >= MOST_PHONES:
                 raise CaptureError(f"{MOST_PHONES} phones are in already. Turn the switch off and on to start anew.")
-            shown = "".join(letter for letter in name if letter.isprintable())[:LONGEST_NAME] or "a phone"
+            shown = in_one_line(name).strip()[:LONGEST_NAME] or "a phone"
             phone = Phone(secrets.token_urlsafe(TOKEN_BYTES), shown, "", time.time(), time.time())
             door.phones[phone.secret] = phone
             door.token = secrets.token_urlsafe(TOKEN_BYTES)
