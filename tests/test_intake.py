@@ -367,6 +367,37 @@ def test_settings_are_changed_one_by_one_and_a_wrong_one_leaves_the_file_as_it_w
     assert load_settings(vase).board is None
 
 
+WRITTEN = [
+    "# my vase\n\nscale = '120 mm' # measured\n\n# end\n",
+    "board = 'card' # lent\n\n[roles]\n# the first ones\nboard = ['a.jpg'] # blurred?\n",
+    '\ufeff# from Windows\r\nscale = "120 mm"   # measured\r\n',
+    "roles = { side = ['s.jpg'] } # walked round\n# led_offset_mm = [1, 2, 3]\n",
+    "# nothing yet\n",
+]
+
+
+@pytest.mark.parametrize("text", WRITTEN)
+def test_what_a_user_wrote_into_session_toml_stays_when_entries_change(studio, text):
+    vase = studio / "vase"
+    path = vase / "session.toml"
+    path.write_bytes(text.encode())
+    before = load_settings(vase)
+    set_entry(vase, "board", "paper:A4")
+    set_role(vase, "b.jpg", "board")
+    settings = load_settings(vase)
+    roles = dict(before.roles)
+    assert settings.board == "paper:A4" and settings.scale == before.scale
+    assert dict(settings.roles) == roles | {"board": (*roles.get("board", ()), "b.jpg")}
+    now = path.read_bytes().decode()
+    for line in text.splitlines():
+        remark = line[line.index("#") :] if "#" in line else line
+        assert remark in now and ("board" in line or "roles" in line or line in now)
+    assert now.startswith("\ufeff") == text.startswith("\ufeff")
+    set_role(vase, "b.jpg", "")
+    set_entry(vase, "board", before.board)
+    assert load_settings(vase) == before
+
+
 def test_a_photo_of_a_sorted_capture_moves_to_the_folder_of_its_role(studio):
     vase = studio / "vase"
     (vase / "photos").mkdir()

@@ -1,14 +1,16 @@
-"""Change entries of session.toml: the others keep their values; comments are lost."""
+"""Change entries of session.toml: all else in it stays as the user wrote it, comments and blank lines too."""
 
-import json
+import codecs
 from pathlib import Path
 from typing import Any
 
+import tomlkit
+
 from capture.errors import CaptureError
 from capture.files.atomic import atomic_file
-from capture.session.session import ROLE_FOLDERS, load_settings, read_entries
+from capture.session.session import ROLE_FOLDERS, SETTINGS_FILE, load_settings, read_entries
 
-SETTINGS_FILE = "session.toml"
+BOM = codecs.BOM_UTF8  # which Windows' editors write at the beginning of a file
 
 
 def set_entry(capture: Path, name: str, value: Any) -> None:
@@ -19,11 +21,19 @@ def set_entry(capture: Path, name: str, value: Any) -> None:
         OSError: it cannot be written.
     """
     path = capture / SETTINGS_FILE
-    before = read_entries(path) if path.exists() else {}
-    entries = {key: old for key, old in before.items() if key != name}
-    if value is not None:
-        entries[name] = value
-    _write(path, entries)
+    before = b""
+    if path.exists():
+        read_entries(path)  # which says what is wrong with it
+        before = path.read_bytes()
+    mark = BOM if before.startswith(BOM) else b""
+    document = tomlkit.parse(before.removeprefix(BOM).decode())
+    if value is None:
+        document.pop(name, None)
+    elif isinstance(value, dict):
+        _update(document.setdefault(name, tomlkit.inline_table()), value)
+    else:
+        document[name] = value
+    _write(path, mark + tomlkit.dumps(document).encode())
     try:
         load_settings(capture)
     except CaptureError:
@@ -61,25 +71,18 @@ def set_role(capture: Path, photo: str, role: str) -> None:
     set_entry(capture, "roles", {name: names for name, names in roles.items() if names} or None)
 
 
-def _write(path: Path, entries: dict[str, Any]) -> None:
-    if not entries:
+def _update(table: Any, values: dict[str, Any]) -> None:
+    """Change what differs in a table of the file, so that the rest of it stays as it is written."""
+    for key in [key for key in table if key not in values]:
+        del table[key]
+    for key, value in values.items():
+        if table.get(key) != value:
+            table[key] = value
+
+
+def _write(path: Path, content: bytes) -> None:
+    if not content.removeprefix(BOM).strip():
         path.unlink(missing_ok=True)
         return
-    lines = [f"{_key(key)} = {_toml(value)}" for key, value in entries.items()]
     with atomic_file(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _toml(value: Any) -> str:
-    """Return a value of TOML on one line; strings and numbers are written as in JSON, which TOML reads alike."""
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_key(key)} = {_toml(one)}" for key, one in value.items()) + " }"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    if isinstance(value, str | bool | int | float):
-        return json.dumps(value, ensure_ascii=False)
-    raise CaptureError(f"session.toml holds {value!r}, which cannot be written again; edit the file by hand.")
-
-
-def _key(key: str) -> str:
-    return key if key.replace("_", "").isalnum() and key.isascii() else json.dumps(key, ensure_ascii=False)
+        temporary.write_bytes(content)
