@@ -1,3 +1,4 @@
+import contextlib
 import io
 import struct
 import zlib
@@ -14,6 +15,7 @@ from capture.decode import formats
 from capture.decode import sandbox as confined
 from capture.decode.exif import Exposure, read_header
 from capture.decode.formats import decode, read_size
+from capture.decode.heif import container_transfer
 from capture.decode.limits import check_size
 from capture.errors import CaptureError
 from capture.photos import photo
@@ -66,6 +68,64 @@ def test_a_heic_file_with_a_turned_container_comes_out_turned_where_nothing_is_u
     Image.fromarray(picture()).save(tmp_path / "turned.heic", exif=exif(6))
     with Image.open(tmp_path / "turned.heic") as image:
         assert image.size == (48, 64)
+
+
+def stating(path: Path, transfer: int) -> Path:
+    """A photo whose container states that transfer curve (nclx, ITU-T H.273)."""
+    save(path, picture())
+    content = path.read_bytes()
+    at = content.index(b"colrnclx") + 10
+    path.write_bytes(content[:at] + transfer.to_bytes(2, "big") + content[at + 2 :])
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".heic", ".avif"])
+@pytest.mark.parametrize("transfer", [1, 2, *range(4, 19)])  # libheif refuses those that H.273 reserves
+def test_a_heic_or_avif_photo_is_read_by_the_curve_that_its_container_states(tmp_path, suffix, transfer):
+    path = stating(tmp_path / f"photo{suffix}", transfer)
+    curve = {16: "PQ", 18: "HLG"}.get(transfer, str(transfer))
+    if transfer in (9, 10, 16, 17, 18):
+        with pytest.raises(CaptureError, match=rf"curve.* {curve}\b|{curve} curve"):
+            decode(path)
+        assert read_size(path) == (64, 48)
+        return
+    found = decode(path)
+    light = {4: lambda v: v**2.2, 5: lambda v: v**2.8, 8: lambda v: v}.get(transfer)
+    assert found.is_linear == (light is not None)
+    expected = picture() / 255.0 if light is None else light(picture() / 255.0)
+    stored = found.pixels if light is not None else found.pixels / 255.0
+    assert np.abs(stored - expected).mean() < 0.02
+
+
+def box(name: bytes, *bodies: bytes) -> bytes:
+    body = b"".join(bodies)
+    return struct.pack(">I", 8 + len(body)) + name + body
+
+
+@pytest.mark.parametrize("version", [0, 1])
+@pytest.mark.parametrize(("first", "tiles", "found"), [(16, 13, 16), (None, 18, 18), (None, None, 2)])
+def test_the_curve_of_a_picture_made_of_tiles_is_its_own_or_theirs_and_not_that_of_a_gain_map(
+    version, first, tiles, found
+):
+    """Item 1 is made of tiles 2 and 3; the gain map is item 4."""
+    wide = ">I" if version else ">H"
+    stated = [first, tiles, tiles, 8]
+    curves = [box(b"colr", b"nclx", struct.pack(">HHHB", 1, curve, 6, 128)) for curve in stated if curve is not None]
+    used, rows = iter(range(1, 5)), b""
+    for item, curve in enumerate(stated, 1):
+        rows += struct.pack(">HB", item, curve is not None) + (bytes([next(used)]) if curve is not None else b"")
+    numbers = struct.pack(wide, 1) + struct.pack(">H", 2) + struct.pack(wide, 2) + struct.pack(wide, 3)
+    meta = box(
+        b"meta",
+        bytes(4),
+        box(b"pitm", bytes(4), struct.pack(">H", 1)),
+        box(b"iref", bytes([version, 0, 0, 0]), box(b"cdsc", numbers), box(b"dimg", numbers)),
+        box(b"iprp", box(b"ipco", *curves), box(b"ipma", bytes(4), struct.pack(">I", 4), rows)),
+    )
+    assert container_transfer(box(b"ftyp", b"heic") + meta) == found
+    for cut in range(8, len(meta), 7):
+        with contextlib.suppress(ValueError):
+            container_transfer(meta[:cut])
 
 
 def test_srgb_decodes_to_the_standards_values_and_back():

@@ -18,11 +18,14 @@ from capture.decode.limits import broken, check_size, colour_of
 from capture.decode.sandbox import Answer, decoding
 from capture.errors import CaptureError
 
-HDR_TRANSFERS = {16: "PQ", 18: "HLG"}  # nclx transfer characteristics (ITU-T H.273) far from the sRGB curve
+# nclx transfer characteristics (ITU-T H.273)
+HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
+LIKE_SRGB = {0, 1, 2, 3, 6, 7, 11, 12, 13, 14, 15}  # sRGB, "unspecified", and video's, which cameras state for sRGB
+POWERS = {4: 2.2, 5: 2.8, 8: 1.0}  # light is this power of the stored value
 MOST_BYTES_PER_PIXEL = 6
 AVIF_BRANDS = (b"avif", b"avis")
 LARGEST_EXIF = 1 << 22  # bytes; most are 64 kB at most, which JPEG allows
-_NO_TRANSFER = 2  # "unspecified" (ITU-T H.273)
+_NO_TRANSFER = 2  # "unspecified"
 
 
 @dataclass(frozen=True)
@@ -46,22 +49,25 @@ def read_heif_header(path: Path) -> HeifHeader:
 
 
 def read_heif(path: Path) -> Shaped[np.ndarray, "height width 3"]:
-    """Return the pixels of a HEIC or AVIF file, 8 or 16-bit, not rotated.
+    """Return the pixels of a HEIC or AVIF file, not rotated: 8 or 16-bit as sRGB, or linear float32.
 
     Raises:
-        CaptureError: the file is damaged, too large, or HDR.
+        CaptureError: the file is damaged, too large, HDR, or has another curve that is not known here.
     """
     with decoding(heif_picture, path) as answer:
         header = _header(path, answer(LARGEST_EXIF))
         check_size(path, header.width, header.height)
-        curve = HDR_TRANSFERS.get(header.transfer)
-        if curve:
-            raise CaptureError(
-                f"{path} is an HDR photo ({curve} curve), ordinary sRGB is needed. Switch HDR (HLG) off."
-            )
+        if header.transfer not in LIKE_SRGB | set(POWERS):
+            curve = HDR_TRANSFERS.get(header.transfer)
+            kind = f"is an HDR photo ({curve} curve)" if curve else f"has the transfer curve {header.transfer} of H.273"
+            raise CaptureError(f"{path} {kind}, ordinary sRGB is needed. Switch HDR (HLG) off, or export it as sRGB.")
         count = header.width * header.height
         found = answer(MOST_BYTES_PER_PIXEL * count, count)
-    return colour_of(path, found and found.pixels)
+    pixels = colour_of(path, found and found.pixels)
+    power = POWERS.get(header.transfer)
+    if power is None or pixels.dtype == np.float32:
+        return pixels
+    return (pixels / np.float32(np.iinfo(pixels.dtype).max)) ** np.float32(power)
 
 
 def _header(path: Path, answer: Answer | None) -> HeifHeader:
@@ -77,16 +83,14 @@ def heif_picture(file: BinaryIO) -> Iterator[Answer]:
     Raises:
         OSError, SyntaxError, ValueError, EOFError, RuntimeError: the file is damaged.
     """
-    is_avif = file.read(12)[8:] in AVIF_BRANDS
+    content = file.read()
+    is_avif = content[8:12] in AVIF_BRANDS
     file.seek(0)
     with AvifImagePlugin.AvifImageFile(file) if is_avif else pillow_heif.HeifImageFile(file) as image:
-        transfer = (image.info.get("nclx_profile") or {}).get("transfer_characteristics", _NO_TRANSFER)
-        yield Answer((*image.size, transfer), pixels=_exif_block(image))
+        yield Answer((*image.size, container_transfer(content)), pixels=_exif_block(image))
         if is_avif:  # Pillow ignores its rotation tags
             yield Answer(pixels=np.asarray(image.convert("RGB")))
             return
-    file.seek(0)
-    content = file.read()
     pixels = np.asarray(pillow_heif.open_heif(content, convert_hdr_to_8bit=False))
     pixels = np.repeat(pixels[..., None], 3, 2) if pixels.ndim == 2 else pixels[..., :3]
     yield Answer(pixels=undo_turns(pixels, container_turns(content)))
@@ -102,14 +106,48 @@ def container_turns(file: bytes) -> list[tuple[bytes, int]]:
 
     Each is (b"irot", quarter turns anti-clockwise) or (b"imir", 0 top-bottom or 1 left-right) [ISO/IEC 23008-12].
     """
-    meta = next((body[4:] for name, body in _boxes(file) if name == b"meta"), b"")
-    inside = dict(_boxes(meta))
-    primary = int.from_bytes(inside.get(b"pitm", b"\0" * 6)[4:], "big")
+    return [(name, body[0]) for name, body in _properties(_meta(file)) if name in (b"irot", b"imir") and body]
+
+
+def container_transfer(file: bytes) -> int:
+    """Return the transfer characteristics (ITU-T H.273) that the container states for the primary picture or its tiles.
+
+    Pillow keeps them from us in AVIF files. A gain map may state others; it is no part of the picture that is decoded.
+    """
+    inside = _meta(file)
+    for item in (None, *_tiles(inside)):
+        colours = [body for name, body in _properties(inside, item) if name == b"colr" and body[:4] == b"nclx"]
+        if colours:
+            return int.from_bytes(colours[0][6:8], "big")
+    return _NO_TRANSFER
+
+
+def _meta(file: bytes) -> dict[bytes, bytes]:
+    return dict(_boxes(next((body[4:] for name, body in _boxes(file) if name == b"meta"), b"")))
+
+
+def _primary(inside: dict[bytes, bytes]) -> int:
+    return int.from_bytes(inside.get(b"pitm", b"\0" * 6)[4:], "big")
+
+
+def _properties(inside: dict[bytes, bytes], item: int | None = None) -> list[tuple[bytes, bytes]]:
+    """Return the properties (type, body) of a picture, in the order in which they apply; None: of the primary one."""
     iprp = dict(_boxes(inside.get(b"iprp", b"")))
     properties = list(_boxes(iprp.get(b"ipco", b"")))
-    indices = _associations(iprp.get(b"ipma", b"\0" * 8)).get(primary, [])
-    used = [properties[i - 1] for i in indices if 0 < i <= len(properties)]
-    return [(name, body[0]) for name, body in used if name in (b"irot", b"imir") and body]
+    used = _associations(iprp.get(b"ipma", b"\0" * 8)).get(_primary(inside) if item is None else item, [])
+    return [properties[i - 1] for i in used if 0 < i <= len(properties)]
+
+
+def _tiles(inside: dict[bytes, bytes]) -> list[int]:
+    """Return the pictures that the primary one is put together from."""
+    iref = inside.get(b"iref", b"\0" * 4)
+    size = 4 if iref[:1] > b"\0" else 2  # bytes of an item's number
+    rows = [
+        [int.from_bytes(body[at : at + size], "big") for at in (0, *range(size + 2, len(body), size))]
+        for name, body in _boxes(iref[4:])
+        if name == b"dimg"
+    ]
+    return [item for first, *items in rows if first == _primary(inside) for item in items]
 
 
 def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -127,11 +165,19 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _associations(ipma: bytes) -> dict[int, list[int]]:
-    """Return the properties (1 = the first in ipco) of each picture, in the order in which they apply."""
+    """Return the properties (1 = the first in ipco) of each picture, in the order in which they apply.
+
+    Raises:
+        ValueError: the table is cut short.
+    """
+    if len(ipma) < 8:
+        raise ValueError("a table of properties that is cut short")
     id_bytes = 2 if ipma[0] == 0 else 4
     index_bytes = 2 if ipma[3] & 1 else 1
     found, at = {}, 8
     for _ in range(int.from_bytes(ipma[4:8], "big")):
+        if at + id_bytes >= len(ipma):
+            raise ValueError("a table of properties that is cut short")
         item, count = int.from_bytes(ipma[at : at + id_bytes], "big"), ipma[at + id_bytes]
         at += id_bytes + 1
         raw = [int.from_bytes(ipma[at + i * index_bytes : at + (i + 1) * index_bytes], "big") for i in range(count)]
