@@ -1,4 +1,6 @@
+import os
 import shutil
+from pathlib import Path
 
 import lit_table
 import numpy as np
@@ -224,3 +226,25 @@ def test_a_photo_that_is_there_twice_is_refused_by_both_names(tmp_path, in_folde
     shutil.copy(photos / "IMG_103.jpg", photos / "IMG_103 (1).jpg")
     with pytest.raises(CaptureError, match=r"IMG_103.*\.jpg and IMG_103.*\.jpg are the same"):
         load_session(folder)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [["IMG_1.jxl"], ["a.webp", "b.WebP", "c.bmp"], ["x.jp2"], ["k.nrw", "raw.x3f"], [os.fsdecode(b"caf\xe9.jpg")]],
+)
+@pytest.mark.parametrize("in_folders", [False, True])
+def test_pictures_that_cannot_be_read_are_named_in_one_line_beside_photos_and_where_photos_are_missing(
+    tmp_path, in_folders, names
+):
+    save_capture(tmp_path / "vase", in_folders)
+    for folder in (tmp_path / "vase", tmp_path / "alone"):
+        for name in names:
+            place = folder / "photos" if in_folders else folder
+            place.mkdir(parents=True, exist_ok=True)
+            (place / name).write_bytes(b"what no decoder is asked for")
+    (note,) = [note for note in load_session(tmp_path / "vase").notes if "skipped" in note]
+    first = Path(names[0]).name.encode("utf-8", "replace").decode()
+    assert first in note and "JPEG, PNG, TIFF or DNG" in note and "\n" not in note
+    assert (f"{len(names) - 1} more" in note) == (len(names) > 1)
+    with pytest.raises(CaptureError, match=r"no photos found in .*skipped.*Export them as JPEG"):
+        load_session(tmp_path / "alone")

@@ -24,6 +24,7 @@ from capture.session.declared_objects import (
     parse_thickness,
 )
 from capture.session.roles import NoBoardError, Roles, find_roles, find_tripod_first
+from capture.session.skipped import naming_skipped
 
 FEWEST_LIT = 4  # below this, shadows leave most of the shape open
 ADVISED_LIT = 12
@@ -108,9 +109,11 @@ def load_session(folder: Path, common: SessionSettings | None = None) -> Session
         if settings.board_thickness_mm is None:
             settings = replace(settings, board_thickness_mm=common.board_thickness_mm)
     sorted_already = (folder / ROLE_FOLDERS["lit"]).is_dir() or (folder / ROLE_FOLDERS["board"]).is_dir()
-    roles, notes = _roles_of_folders(folder, settings) if sorted_already else _roles_of_flat_folder(folder, settings)
-    roles = _overruled(roles, folder, settings)
-    _refuse_too_few(roles, folder, needs_board=common is None)
+    with naming_skipped(folder, ROLE_FOLDERS.values()) as skipped:
+        read = _roles_of_folders if sorted_already else _roles_of_flat_folder
+        roles, notes = read(folder, settings)
+        roles, notes = _overruled(roles, folder, settings), notes + skipped
+        _refuse_too_few(roles, folder, needs_board=common is None)
     _refuse_copies(roles.lit)
     if sorted_already and not any(role == "board" for role, _ in settings.roles):
         roles = replace(roles, board=find_tripod_first(roles.board, roles.lit))

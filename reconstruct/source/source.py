@@ -36,8 +36,7 @@ DESCRIPTIONS = (
 )  # files that may describe a known scene
 WITHOUT_BOARD = (
     "Without a board, the directions of the lights are missing: a file of lights (--lights FILE.lp) gives them, or a "
-    "shiny ball in the picture (none was found; session.toml may name it: ball = [x, y, radius], pixels). The focal "
-    "length that EXIF states is not enough for a shape."
+    "shiny ball in the picture (none was found; session.toml may name it: ball = [x, y, radius], pixels)."
 )
 TRAINER_ABLATIONS = ("expected-depth", "sampled")  # the default solver has neither
 
