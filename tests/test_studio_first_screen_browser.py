@@ -21,7 +21,7 @@ on_a_page = [
 STATE = "window.shadowgraph ? window.shadowgraph.state() : null"
 SMALL = {"width": 1000, "height": 640}
 SIZES = {"desktop": DESKTOP, "phone": PHONE, "small": SMALL}
-PAGES = {"": ".card", "capture/vase": ".verdict", "run/runs%2Fvase": "h2", "run/runs%2Fheap": ".save"}
+PAGES = {"": ".card", "capture/vase": "section.panel", "run/runs%2Fvase": "h2", "run/runs%2Fheap": ".save"}
 
 
 def marked(test):
@@ -135,6 +135,16 @@ def test_keys_reach_the_result_while_a_button_has_the_focus(browser, folder, but
         assert button in tab.evaluate("document.activeElement.innerText") and not bad
 
 
+@pytest.mark.parametrize("size", SIZES)
+@marked
+def test_the_picture_alone_fills_the_window(browser, folder, size):  # noqa: F811
+    with served(folder) as (_, _, owner):
+        tab, bad, _ = result_of(browser, owner, SIZES[size])
+        tab.click("button:has-text('Fill the window')")
+        wait_until(tab, lambda: tab.evaluate("document.fullscreenElement !== null"))
+        assert tab.evaluate("document.fullscreenElement.className") == "result" and not bad
+
+
 @marked
 def test_keys_that_are_typed_into_a_field_stay_there(browser, folder):  # noqa: F811
     with served(folder) as (_, _, owner):
@@ -172,7 +182,7 @@ def test_every_text_stands_out_also_on_buttons_that_cannot_be_pressed(browser, f
         tab.emulate_media(color_scheme=scheme)
         for page, ready in {
             "": ".card",
-            "capture/vase": ".verdict",
+            "capture/vase": "section.panel",
             "run/runs%2Fvase": "h2",
             "run/runs%2Fheap": ".save",
         }.items():

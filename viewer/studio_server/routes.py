@@ -135,7 +135,9 @@ def _stage(studio: Studio, request: Request) -> Response:
 
 def _example() -> Response:
     page = example_page()
-    return Response("", 404) if page is None else Response(page, media_type=HTML, headers=STAGED)
+    if page is None:
+        raise CaptureError('The result that came with this installation is damaged. "Try the example" makes another.')
+    return Response(page, media_type=HTML, headers=STAGED)
 
 
 async def _keep_document(studio: Studio, request: Request) -> Response:

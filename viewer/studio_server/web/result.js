@@ -169,6 +169,7 @@ addEventListener("keydown", (event) => {
   const frames = document.querySelectorAll("iframe.result");
   if (isTaken || !frames.length || !KEYS.test(event.key)) return;
   event.preventDefault();
+  if (event.key === "?") frames[0].focus(); // Escape then closes the list of keys
   for (const one of frames) one.contentWindow.postMessage({ press: { key: event.key, shiftKey: event.shiftKey } }, "*");
 });
 
