@@ -12,6 +12,7 @@ import pytest
 
 from capture.session.capture import load_capture
 from capture.session.session import ADVISED_LIT
+from viewer.studio.example import RESULT
 
 ROOT = Path(__file__).parent.parent
 SOURCES = (".py", ".typed", ".html", ".css", ".js", ".glsl", ".svg", ".zip")
@@ -63,7 +64,7 @@ def test_the_wheel_brings_the_pages_of_the_studio(wheel_names):
 def test_the_wheel_brings_the_example_of_the_studio(wheel_names):
     there = {path.name for path in (ROOT / "examples" / "spot").rglob("*") if path.is_file()}
     assert {Path(n).name for n in wheel_names if "/share/shadowgraph/examples/spot/" in n} == there
-    assert "viewer/studio/example.zip" in wheel_names
+    assert f"viewer/studio/{RESULT.name}" in wheel_names
 
 
 def test_the_wheel_is_plain_python(wheel_names):

@@ -5,11 +5,11 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 from capture.errors import CaptureError
-from reconstruct.stored_run.stage_pack import opened_pack
+from reconstruct.stored_run.stage_pack import FORMAT, opened_pack
 from viewer.stage.page import page_html
 
 TITLE = "Spot, an example"
-RESULT = Path(__file__).with_name("example.zip")  # a stage; .ci/example_result.py makes it
+RESULT = Path(__file__).with_name(f"example-{FORMAT}.zip")  # a stage; .ci/example_result.py makes it
 PLACE = ("examples", "spot", "session.toml")  # in a checkout, and in share/shadowgraph of an installation
 
 
