@@ -91,6 +91,7 @@ def check(command: Check, console: Console) -> None:
 
 def _print_result(out: Path, console: Console) -> None:
     """Print how many photos were used, what was assumed, what to doubt and where the results are."""
+    from calibration.board.board_scale import scale_sentence
     from calibration.calibrated_views import load_views
     from capture.files.atomic import read_json
     from reconstruct.stored_run.documents import lit_photos
@@ -102,6 +103,7 @@ def _print_result(out: Path, console: Console) -> None:
     unused = [f"{name} ({row['reason']})" for name, row in photos.items() if not row["used"]]
     used = sum(bool(row["used"]) for row in photos.values())
     lines = [f"{used} of {len(photos)} photos used", *(f"left out: {text}" for text in unused)]
+    lines += dict.fromkeys(filter(None, (scale_sentence(view.calibration.residuals) for view in views)))
     lines += dict.fromkeys(str(note) for view in views for note in view.calibration.residuals.get("notes", []))
     warnings = report.get("warnings", [])
     print_lines(console, *lines, *(f"warning: {text}" for text in warnings), f"Results in {out}")

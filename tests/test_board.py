@@ -194,7 +194,7 @@ def test_an_unnamed_board_is_recognised_and_its_millimetres_called_assumed():
     assert charuco is not None and checker is not None
     assert (charuco.board.columns, charuco.board.rows, charuco.board.dictionary) == (5, 7, "DICT_4X4_50")
     assert (checker.board.columns, checker.board.rows) == (9, 6)
-    assert "ASSUMED" in charuco.note and "ASSUMED" in checker.note
+    assert "assumed" in charuco.note and "assumed" in checker.note
 
 
 @pytest.mark.parametrize("n_false", [0, 4])

@@ -9,14 +9,15 @@ import numpy as np
 
 from calibration.board.blank import BLANKS, Blank
 from calibration.board.board import AnyBoard, Board, parse_board
-from calibration.board.board_in_flash import under_the_flashlight
 from calibration.board.board_pose import ROBUST_AT, SAME_LENS, fit_ground
-from calibration.board.corners import Corners, Grey, find_board, grey_of
+from calibration.board.board_scale import marker_share, scale_doubts, scale_of
+from calibration.board.corners import Corners, Grey, find_board, grey_of, under_the_flashlight
 from calibration.board.intrinsics import CameraFit, fit_camera, sides_ratio
 from calibration.board.recognise import guess_board, is_mirrored
 from calibration.board.sheet_edges import find_edges
 from calibration.posed_camera import PosedCamera
-from capture.decode.exif import front_lens
+from capture.decode.exif import front_lens, optics_of
+from capture.decode.formats import read_exif
 from capture.errors import CalibrationError
 from capture.photos.photo import read_photo
 from capture.session.session import Session
@@ -218,8 +219,13 @@ def _above(
     """
     assert tripod.corners is not None
     ground = fit_ground(fit.on_sheet(tripod.corners), fit.camera, fit.pose_spread(index), robust_at)
+    board = tripod.corners.board
+    centre = board.points().mean(0)
+    away = float(np.linalg.norm(ground.world_from_camera.translation - centre))
+    optics, share = optics_of(read_exif(tripod.path)), marker_share(tripod.grey, tripod.corners)
     residuals = {
-        "board": tripod.corners.board.spec(),
+        "board": board.spec(),
+        "scale": scale_of(board, is_named),
         "board_photos": rows,
         "reprojection_rms_px": fit.rms_px,
         "ground_rms_px": ground.rms_px,
@@ -229,7 +235,10 @@ def _above(
         "pose_covariance": ground.covariance.tolist(),
         "sheet_waves_mm": fit.waves_mm(),
         "notes": [*notes, *_partly_seen(tripod.corners), *fit.notes],
-        "warnings": _warnings(tripod.path, tripod.corners.board, is_named),
+        "warnings": [
+            *_warnings(tripod.path, board, is_named),
+            *scale_doubts(board, away, tripod.path.name, optics, share),
+        ],
     }
     return BoardFit(PosedCamera(fit.camera, ground.world_from_camera, 0.0), fit, residuals)
 

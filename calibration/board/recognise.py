@@ -51,11 +51,7 @@ def guess_board(photos: Sequence[Grey]) -> BoardGuess | None:
     board = _guess_charuco(photos) or _guess_checkerboard(photos)
     if board is None:
         return None
-    note = (
-        f"No board was named; the photos show {board.spec()}. Its millimetres are ASSUMED (squares of "
-        f"{board.square_mm:g} mm): measure a square and give --board, else every length is off by one common factor."
-    )
-    return BoardGuess(board, note)
+    return BoardGuess(board, f"No board was named; the photos show {board.spec()}, whose millimetres are assumed.")
 
 
 def is_mirrored(photos: Sequence[Grey]) -> bool:

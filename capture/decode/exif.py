@@ -13,6 +13,10 @@ from capture.decode.formats import read_exif, read_size
 
 FULL_FRAME_DIAGONAL = 43.27  # mm: what "35 mm equivalent" refers to
 ORDINARY_FOCAL_35MM = 27.0  # mm, of photos that do not tell theirs: main cameras of phones have 23 to 28
+ORDINARY_FOCAL_MM = 5.6  # of such a camera, on its sensor of 1/1.7 inch
+PHONE_STROKE_MM = 0.5  # how far the focus motors of phones move a lens: 0.3 to 0.5 mm
+SMALL_SENSOR = 2.5  # full frame's diagonal over the sensor's; the largest in phones, of 1 inch, has 2.7
+FAR_AWAY = 1e6  # mm: files write infinity as a huge number
 FRONT = re.compile(r"\b(front|truedepth|selfie)\b", re.IGNORECASE)  # in the lens names of phones
 
 
@@ -29,6 +33,29 @@ class Exposure:
         if self.time_s is None or self.iso is None:
             return None
         return self.time_s * self.iso / (self.f_number or 1.0) ** 2
+
+
+@dataclass(frozen=True)
+class Optics:
+    """The lens and where it was focused, mm; None where the file does not state it."""
+
+    focal_mm: float | None = None
+    focal_35mm: float | None = None
+    focus_mm: float | None = None
+
+    def closest_mm(self) -> float:
+        """Return how near a thing can be in focus.
+
+        A lens of focal length f that is moved by s from where infinity is sharp is in focus at f + f^2 / s. Larger
+        cameras have lenses that show things in life size: at 2 f.
+        """
+        focal = self.focal_mm or ORDINARY_FOCAL_MM
+        is_phone = self.focal_mm is None or (self.focal_35mm or 2 * SMALL_SENSOR * focal) / focal > SMALL_SENSOR
+        return focal + focal**2 / PHONE_STROKE_MM if is_phone else 2 * focal
+
+    def words(self) -> str:
+        """Return what lens that is."""
+        return f"its lens of {self.focal_mm:.3g} mm (EXIF)" if self.focal_mm else "the camera of a phone"
 
 
 @dataclass(frozen=True)
@@ -61,6 +88,13 @@ def tag_of(exif: Image.Exif, tag: int) -> object:
 def focal_of(exif: Image.Exif) -> float | None:
     """Return the 35 mm equivalent focal length, mm; None where missing."""
     return _positive(tag_of(exif, 41989))
+
+
+def optics_of(exif: Image.Exif) -> Optics:
+    """Return focal length and focus distance (SubjectDistance)."""
+    metres = _positive(tag_of(exif, 37382))
+    focus = None if metres is None or 1000 * metres > FAR_AWAY else 1000 * metres
+    return Optics(_positive(tag_of(exif, 37386)), focal_of(exif), focus)
 
 
 def focal_in_pixels(focal_35mm: float | None, width: int, height: int) -> float:

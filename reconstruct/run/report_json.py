@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import trimesh
 
+from calibration.board.board_scale import scale_sentence
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
 from reconstruct.run_folder.folder import LOG, PLAN, RunFolder, read_log
@@ -51,6 +52,7 @@ def summary(
         "capture": source.folder.resolve().name,
         "command": command_line(source, options),
         "unit": calibration.unit,
+        "scale": scale_sentence(calibration.residuals),
         **asdict(options),
         "stages": {name: asdict(cost) for name, cost in run.costs.items()},
         "photos": [

@@ -38,7 +38,7 @@ def checked_report(document: JsonField) -> dict[str, Any]:
         CalibrationError: a value is of another kind; names it.
     """
     report = document.any_numbers()
-    for name in ("error", "verdict", "command", "capture", "unit"):
+    for name in ("error", "verdict", "command", "capture", "unit", "scale"):
         document.get(name, "").text()
     for name in ("warnings", "assumptions"):
         for line in document.get(name, []).entries():

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from calibration.board.board_scale import scale_sentence
 from calibration.calibration import Calibration
 from calibration.light import Light
 from capture.files.atomic import atomic_file
@@ -45,6 +46,7 @@ def check_page(checked: CaptureCheck) -> str:
         f'<p class="verdict {KINDS[readiness.grade]}">{doc.html.escape(readiness.sentence())}</p>'
         f"{doc.facts(_numbers(checked))}</header>"
     )
+    notes = [*filter(None, [scale_sentence(calibration.residuals)]), *checked.notes]
     parts = [
         header,
         doc.section("What to shoot next", "Most useful first; then check again.", doc.bullets(readiness.advice)),
@@ -61,7 +63,7 @@ def check_page(checked: CaptureCheck) -> str:
         *_phone_back(checked),
         doc.section("Photos", "One line per photo. It is good if the last column is empty.", _photo_table(checked)),
         *(_further(one) for one in checked.further),
-        doc.section("Please note", "What was assumed or chosen on the way.", doc.bullets(checked.notes)),
+        doc.section("Please note", "What was assumed or chosen on the way.", doc.bullets(notes)),
     ]
     return doc.page(f"Shadowgraph check: {checked.name}", "".join(parts))
 
@@ -200,8 +202,8 @@ def _place(light: Light, checked: CaptureCheck) -> list[str]:
 def check_lines(checked: CaptureCheck) -> list[str]:
     """Return the verdict as lines for the terminal: reasons, lights as a polar plot, what to shoot next."""
     readiness = checked.readiness
-    lines = [readiness.sentence()]
-    lines += [f"  - {reason}" for reason in readiness.reasons[1:]]
+    lines = [readiness.sentence(), *(f"  - {reason}" for reason in readiness.reasons[1:])]
+    lines += filter(None, [scale_sentence(checked.calibration.residuals)])
     lines += ["", "Lights seen from above, camera at the bottom, o = used, x = not used:"]
     lines += polar_plot(checked.calibration, checked.cover)
     lines += [f"{f.photo.name}: {f.kind}, {f.text}" for f in checked.findings]

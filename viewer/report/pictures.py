@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
+from calibration.board.board_scale import scale_parts
 from calibration.calibration import Calibration
 from reconstruct.fields import Fields
 from reconstruct.stored_run.maps import thumbnail_name
@@ -54,6 +55,9 @@ def size_facts(mesh: trimesh.Trimesh, calibration: Calibration | None) -> list[t
     ]
     if closed and is_mm:
         out.append(_volume_fact(mesh))
+    scale = None if calibration is None else scale_parts(calibration.residuals)
+    if scale:
+        out.append((scale[0], f"Every length rests on this, {scale[1]}. Measure it."))
     return out
 
 

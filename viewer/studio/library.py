@@ -106,6 +106,7 @@ class Library:
             "verdict_sentence": in_page_words(check.get("sentence", "")),
             "size": mesh.get("size") if state == FINISHED else None,
             "unit": report.get("unit", "mm"),
+            "scale": str(report.get("scale", "")),
             "guessed": ((mesh.get("evidence") or {}).get("unconstrained") or {}).get("share"),
             "growing": mark_of(path) if state == RUNNING else "",
             "warnings": [in_page_words(text) for text in report.get("warnings", [])[:20]],

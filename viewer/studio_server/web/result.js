@@ -62,6 +62,7 @@ export function run(name, again) {
       h("ul", { class: "facts" }, [size(one), one.preset && presetWords(one.preset), `made in ${duration(one.progress.elapsed_s)}`,
         one.guessed !== null && one.guessed !== undefined && `${Math.round(100 * one.guessed)} % of the surface is a guess: no photo shows it`]
         .filter(Boolean).map((text) => h("li", {}, text))),
+      one.scale && h("p", { class: "quiet" }, one.scale),
       one.verdict_sentence && h("p", {}, one.verdict_sentence),
       one.warnings.length > 0 && h("details", { class: "panel" }, h("summary", { class: "warn" }, plural(one.warnings.length, "remark")),
         h("ul", { class: "plain" }, one.warnings.map((text) => h("li", {}, text)))),

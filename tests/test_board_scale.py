@@ -1,0 +1,133 @@
+"""What every length rests on is said, and a size that lens, focus or markers contradict is doubted."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from board_photos import board_photo, look_at
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+from calibration.board.board import Board, parse_board
+from calibration.board.board_photos import fit_board
+from calibration.board.board_scale import scale_doubts, scale_of, scale_parts, scale_sentence
+from calibration.camera import Camera
+from capture.decode.exif import Optics, optics_of
+from capture.session.session import Session, SessionSettings
+
+CAMERA = Camera(1200, 900, 1000.0, 1000.0, 599.5, 449.5)
+BOARD = Board("charuco", 5, 7, 30.0, 22.0, "DICT_4X4_50")
+PHONE = {37386: IFDRational(56, 10), 41989: 26}  # focal length, and on full frame
+FOCUS = 37382
+
+
+@cache
+def places() -> tuple[np.ndarray, ...]:
+    """The board from the tripod, about 600 mm away, and from two other sides."""
+    at = ((75.0, -420.0, 480.0), (250.0, -380.0, 420.0), (-120.0, -360.0, 430.0))
+    return tuple(board_photo(BOARD, CAMERA, look_at(place)) for place in at)
+
+
+def session(folder: Path, tags: dict[int, object]) -> Session:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update(tags)
+    paths = tuple(folder / f"IMG_{number}.jpg" for number in range(3))
+    for path, grey in zip(paths, places(), strict=True):
+        Image.fromarray(grey).convert("RGB").save(path, quality=95, exif=exif)
+    return Session(folder, paths, (), (), (), SessionSettings())
+
+
+def found(tmp_path, spec, tags):
+    residuals = fit_board(session(tmp_path, tags), spec).residuals
+    return residuals, [text for text in residuals["warnings"] if "no board was named" not in text]
+
+
+@pytest.mark.parametrize(
+    ("spec", "tags", "unit"),
+    [
+        ("charuco:5x7:3:2.2:DICT_4X4_50", PHONE, "in centimetres it would be 30 mm"),
+        ("charuco:5x7:1.1811:0.86614:DICT_4X4_50", PHONE, "in inches it would be 30 mm"),
+        ("charuco:5x7:0.03:0.022:DICT_4X4_50", {}, "in metres it would be 30 mm"),
+        ("charuco:5x7:3:2.2:DICT_4X4_50", {}, "in centimetres it would be 30 mm"),
+        ("charuco:5x7:3:2.2:DICT_4X4_50", {FOCUS: IFDRational(6, 10)}, "in centimetres it would be 30 mm"),
+    ],
+)
+def test_a_board_typed_in_another_unit_is_doubted_and_the_unit_named(tmp_path, spec, tags, unit):
+    residuals, doubts = found(tmp_path, spec, tags)
+    (doubt,) = doubts
+    assert unit in doubt and "Measure a square" in doubt and "smaller than a stamp" in doubt
+    assert scale_parts(residuals) == (f"one square = {parse_board(spec).square_mm:g} mm", "as you typed it")
+
+
+@pytest.mark.parametrize(
+    ("spec", "tags", "sign"),
+    [
+        ("charuco:5x7:300:220:DICT_4X4_50", {}, "larger than the largest sheet"),
+        ("charuco:5x7:120:88:DICT_4X4_50", {FOCUS: IFDRational(6, 10)}, "was focused at 600 mm"),
+        ("charuco:5x7:40:22:DICT_4X4_50", {}, "a square has about 30 mm"),
+        ("charuco:5x7:25:22:DICT_4X4_50", {}, "a square has about 30 mm"),
+    ],
+)
+def test_a_wrong_square_is_doubted_where_the_photo_contradicts_it(tmp_path, spec, tags, sign):
+    _, doubts = found(tmp_path, spec, tags)
+    assert len(doubts) == 1 and sign in doubts[0], doubts
+
+
+@pytest.mark.parametrize(
+    ("spec", "tags"),
+    [
+        (BOARD.spec(), {}),
+        (BOARD.spec(), {**PHONE, FOCUS: IFDRational(55, 100)}),
+        (BOARD.spec(), {**PHONE, FOCUS: IFDRational(4294967295, 1)}),  # infinity: not said
+        (BOARD.spec(), {37386: IFDRational(50, 1), 41989: 75, FOCUS: IFDRational(0, 1)}),
+        (None, PHONE),
+    ],
+)
+def test_a_board_of_its_true_size_is_not_doubted_whatever_the_file_says(tmp_path, spec, tags):
+    residuals, doubts = found(tmp_path, spec, tags)
+    assert doubts == []
+    assert ("assumed" in scale_sentence(residuals)) == (spec is None)
+
+
+@pytest.mark.parametrize(
+    ("spec", "is_named", "said"),
+    [
+        ("charuco:5x7:30:22:DICT_4X4_50", True, "one square = 30 mm, as you typed it"),
+        ("charuco:7x9:25:18:DICT_4X4_50", True, "one square = 25 mm, from the board's print"),
+        ("checkerboard:9x6:22.5", False, "one square = 22.5 mm, which is assumed"),
+        ("paper:A4", True, "paper:A4 = 297 x 210 mm, as such sheets"),
+    ],
+)
+def test_what_every_length_rests_on_is_one_sentence(spec, is_named, said):
+    assert said in scale_sentence({"scale": scale_of(parse_board(spec), is_named)})
+
+
+@pytest.mark.parametrize("entry", [None, 3, {"length": 1, "from": "x"}, {"length": "x"}])
+def test_a_strangers_entry_of_the_scale_is_left_out(entry):
+    assert scale_parts({"scale": entry}) is None and scale_sentence({"scale": entry}) == ""
+
+
+@pytest.mark.parametrize(
+    ("optics", "closest"),
+    [
+        (Optics(), 68.3),  # an ordinary phone
+        (Optics(1.57, 13.0), 6.5),  # a phone's wide lens, which does macro
+        (Optics(6.9, 24.0), 102.1),
+        (Optics(50.0, 75.0), 100.0),  # a larger camera, at life size
+    ],
+)
+def test_how_near_a_lens_is_sharp_follows_from_its_focal_length(optics, closest):
+    assert optics.closest_mm() == pytest.approx(closest, abs=0.1)
+    near, far = (scale_doubts(BOARD, away, "IMG_1.jpg", optics, None) for away in (0.9 * closest, 1.1 * closest))
+    assert len(near) == 1 and "not sharp nearer" in near[0] and far == []
+
+
+def test_focus_is_read_in_millimetres_and_nonsense_is_none():
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({FOCUS: IFDRational(123, 100), 37386: IFDRational(-1, 2), 41989: 26})
+    read = optics_of(exif)
+    assert (read.focal_mm, read.focal_35mm) == (None, 26.0) and read.focus_mm == pytest.approx(1230)
+    assert optics_of(Image.Exif()) == Optics()
+    assert replace(Optics(), focal_mm=5.6).words() == "its lens of 5.6 mm (EXIF)"
