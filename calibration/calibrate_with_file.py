@@ -99,7 +99,9 @@ def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> 
         lights.append(replace(light, position=mean, sigma=np.sqrt(np.diag(covariance))))
     notes = [*found.residuals.get("notes", []), f"lights: {len(opinions)} of {len(lights)} also from {path}"]
     if apart:
-        notes.append(f"photos and {path} contradict each other about {', '.join(apart)}: check its axes and its sigmas")
+        notes.append(
+            f"photos and {path} contradict each other about {', '.join(apart)}: check its axes and how exact it says it is"
+        )
     return replace(found, lights=tuple(lights), residuals=found.residuals | {"notes": notes})
 
 

@@ -71,10 +71,10 @@ class Verdict:
     def sentence(self) -> str:
         """State the decision and its numbers."""
         numbers = (
-            f"shadow rays that were held out are off by {100 * self.refined:.3g} % with them and by "
-            f"{100 * self.calibrated:.3g} % with the calibrated ones, noise {100 * self.noise:.2g} %"
+            f"of shadows that were set aside for a test, {100 * self.refined:.3g} % are wrong with them, "
+            f"{100 * self.calibrated:.3g} % without, and {100 * self.noise:.2g} % by chance"
         )
-        return f"refined lights {'accepted' if self.is_accepted else 'rejected'}: {numbers}"
+        return f"moved lights are {'' if self.is_accepted else 'not '}kept: {numbers}"
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ class ReconstructResearch(CalibrateResearch):
     ablate: Given[Ablation] = None
     """Leave one part of the method out, or change it, to see what it is worth."""
     device: Device = "auto"
-    """Where the surface is fitted. cpu: compiled kernels; cuda: torch on a graphics card; torch-cpu: the code of cuda
+    """Where the surface is fitted. cpu: the processor; cuda: a graphics card; torch-cpu: the code of cuda
     on the CPU, much slower, to compare; auto: cpu, or where a field is trained (paper), cuda if there is one."""
     detail: Literal["auto", "on", "off"] = "auto"
     """Normals and albedo at the photos' own resolution, on the finished surface; auto: with --preset fine."""
@@ -111,7 +111,7 @@ class Reconstruct(Calibrate):
     """One known length of the object, such as "120 mm" (also cm, m, in), where no board gives the scale: its height
     above the ground or, without a ground, its largest extent across the picture. session.toml may say it, too."""
     time_budget: Given[float] = None
-    """Shorten the schedule so that the run takes about this many seconds here, measured with a short loop."""
+    """Make the run shorter, so that it takes about this many seconds on this machine."""
     memory: Given[float] = None
     """Gigabytes that the run may take; what this machine has free unless given. If that is too little, the run uses
     fewer photos or pixels and says so."""

@@ -108,14 +108,19 @@ class Display:
             return
         if self._task is None:
             self._task = self.progress.add_task(name, words=words, total=1.0)
-        words = ", ".join(filter(None, (words, self._doing)))
+        words = ", ".join(filter(None, (words, _beside(name, self._doing))))
         self.progress.update(self._task, description=name, completed=share, words=words)
 
     def _print(self, doing: str) -> None:
         self._last = self._clock()
         name, _, words = self._where()
-        text = ", ".join(filter(None, (words, doing)))
+        text = ", ".join(filter(None, (words, _beside(name, doing))))
         print_lines(self.console, ": ".join(filter(None, (name, text))))
+
+
+def _beside(name: str, doing: str) -> str:
+    """Return what is done, unless the stage's name says it."""
+    return "" if doing.casefold() == name.casefold() else doing
 
 
 def _call_until(beat: Callable[[], None], ended: threading.Event) -> None:

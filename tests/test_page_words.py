@@ -88,3 +88,39 @@ def test_a_failed_check_and_a_finished_run_speak_of_buttons(tmp_path):
         'Lengths are assumed: measure a square and say it under "Board" ("Another board").'
     ]
     assert page == "<style>:root{--bg:#fff}</style><li>No board. Start another run.</li>"
+
+
+WORKSHOP = re.compile(  # words of a workshop, which nobody says who photographs a vase
+    r"\b(to be told|as it looks|light's phone(?<!flashlight's phone)|phones away|fused|numba|kernels|residuals?|rms|"
+    r"held[ -]out|photos usable|largest gap|shading alone$|next level|ASSUMED|sigmas)\b"
+)
+OF_THE_PAPER = {"options.py", "trainer.py"}  # options for research, and what a trained field says
+
+
+def said_texts() -> Iterator[tuple[str, str]]:
+    """Sentences of four words or more in the program, beside its docstrings, and in the pages."""
+    for package in ("capture", "calibration", "reconstruct", "viewer", "shadowgraph"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+            for node in ast.walk(tree):
+                is_text = isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs
+                if is_text and node.value.count(" ") >= 3 and path.name not in OF_THE_PAPER:
+                    yield path.name, node.value
+    for path in sorted((ROOT / "viewer").rglob("*.js")):
+        code = re.sub(r"//.*|/\*[\s\S]*?\*/", "", path.read_text(encoding="utf-8"))
+        for text in re.findall(r'"[^"\n]*"|`[^`]*`', code):
+            yield path.name, text
+
+
+def test_no_sentence_uses_a_word_of_the_workshop():
+    texts = list(said_texts())
+    assert len(texts) > 1000
+    assert [(name, text) for name, text in texts if WORKSHOP.search(text)] == []
+
+
+@pytest.mark.parametrize(
+    "text", ["photos to be told", "held-out rays are off", "light's phone", "by fused CPU kernels"]
+)
+def test_a_word_of_the_workshop_is_found(text):
+    assert WORKSHOP.search(text) and not WORKSHOP.search("the flashlight's phone")

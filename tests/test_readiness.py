@@ -72,7 +72,7 @@ def test_shadows_and_object_are_where_they_were_rendered(truth, cover):
 def test_many_photos_from_all_around_are_good(truth, cover):
     found = judge(truth.calibration, (), cover)
     assert found.grade == "good" and found.reasons == () and found.advice == ()
-    assert found.sentence().startswith("Good: 26 of 26 photos usable, light from all around")
+    assert found.sentence().startswith("Good: 26 of 26 photos can be used, and light came from all sides.")
     refuse_hopeless(found)
 
 
@@ -180,7 +180,7 @@ def test_a_tripod_that_moved_is_a_reason_and_the_advice_is_to_photograph_the_boa
     found = judge(replace(truth.calibration, lights=lights), left_out, cover)
     moved = (
         f"the tripod moved: 19 photos, {names[7]} to {names[-1]}, lie up to 9 px off the photo of the board "
-        "(0.6 px may be) and are left out, 7 photos with the board's view are used"
+        "(at most 0.6 px is fine) and are left out, 7 photos with the board's view are used"
     )
     assert found.grade == "poor" and moved in found.reasons
     assert any(advice.startswith("Photograph the board again as the tripod stands now") for advice in found.advice)

@@ -89,7 +89,7 @@ def test_the_report_of_a_whole_run_has_every_part(whole_page):
 def test_a_note_of_the_calibration_that_the_run_repeats_is_shown_once(tmp_path, truth):
     fake_run.start_run(tmp_path, truth)
     fake_run.finish_run(tmp_path, truth)
-    note = "lights: from the ground's shading alone"
+    note = "lights: placed by how bright the ground is, and by nothing else"
     calibration = fake_run.calibration_of(truth)
     noted = replace(calibration, residuals={**calibration.residuals, "notes": [note]})
     save_calibration(noted, tmp_path / "calibration.json")

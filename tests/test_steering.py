@@ -97,7 +97,7 @@ def test_a_level_ends_at_its_next_rest_and_the_next_one_is_done_whole(tmp_path, 
         _, seen, _ = solve(scene, SMALL, run, {3: ["next-level"]})
         steps = [done for stage, done in seen if stage == "solve"]
         assert steps == [*range(1, 11), *range(21, 41)]
-        assert not open_requests(run.path) and _requests(run) == [f"{ON_REQUEST}the level ends here"]
+        assert not open_requests(run.path) and _requests(run) == [f"{ON_REQUEST}this round ends here"]
 
 
 def test_another_resolution_begins_with_the_next_level_and_is_the_same_whenever_it_is_resumed(tmp_path, scene):
@@ -105,7 +105,7 @@ def test_another_resolution_begins_with_the_next_level_and_is_the_same_whenever_
         with pytest.raises(Rescheduled) as change:
             solve(scene, SMALL, run, {3: ["draft"], 4: ["fine"]})
         assert (change.value.resolution, change.value.config, change.value.state.level) == ("fine", FINER, 1)
-        assert f"{ON_REQUEST}going on as fine after level 1" in messages(run)
+        assert f"{ON_REQUEST}going on as fine after round 1" in messages(run)
     once, seen, _ = solve(scene, FINER, None, {}, earlier=change.value.state)
     assert seen[0] == ("solve", 21) and seen[-1] == ("solve", 30)
     again, _, _ = solve(scene, FINER, None, {}, earlier=change.value.state)

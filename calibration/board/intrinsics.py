@@ -195,7 +195,9 @@ def _chosen_lens(plain: Solution, photos: Sequence[Corners], size: tuple[int, in
         if error < CLEARLY_BETTER * least:
             best, least = lens, error
     if best is not plain.lens:
-        notes.append(f"The lens is described by {best.name}: that predicts held-out corners best ({least:.2f} px).")
+        notes.append(
+            f"The lens is described by {best.name}: that fits corners best that it was not made from ({least:.2f} px)."
+        )
     return best
 
 

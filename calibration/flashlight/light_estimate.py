@@ -52,19 +52,19 @@ RANGES = (0.2, 4.0)  # of the camera's distance
 LARGEST_SIGMA = 0.08  # of the range, before HONEST_SHARE
 LARGEST_JOINT_SIGMA = 0.25  # of lights from outlines and shading: the solver's shadow rays take over from there
 FEWEST_USED = 2 / 3  # of the photos that shading alone must place
-BY_SHADING = "lights: from the ground's shading alone"
+BY_SHADING = "lights: placed by how bright the ground is, and by nothing else"
 BY_DOUBTED_SHADING = (
     BY_SHADING + ", which contradicts itself: this phone or flashlight changes brightness from place to place. Expect "
     "errors of {:.0%} of a light's distance; photos in light/, or RAW photos, make them exact"
 )
 BY_OUTLINES = (
-    "lights: from the outlines of shadows and object, their common scale from the shading of all photos. This phone or "
-    "flashlight changes brightness from place to place, so shading alone would misplace them. Expect errors of a tenth "
-    "of a light's distance; photos in light/, or RAW photos, make them exact"
+    "lights: placed by the outlines of shadows and object; how far away they all are, by how bright the ground is. "
+    "This phone or flashlight changes brightness from place to place, so shading alone would misplace them. Expect "
+    "errors of a tenth of a light's distance; photos in light/, or RAW photos, make them exact"
 )
 BY_CUES = (
-    "lights: from the outlines of shadows and object, their common scale from {}. This phone or flashlight changes "
-    "brightness from place to place, so shading alone would misplace them"
+    "lights: placed by the outlines of shadows and object; how far away they all are, by {}. This phone or flashlight "
+    "changes brightness from place to place, so shading alone would misplace them"
 )
 AMBIGUOUS = 0.1  # of a light's distance, between fits that are about as likely: the user is told
 BY_SEVERAL = (

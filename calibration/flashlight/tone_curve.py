@@ -59,7 +59,7 @@ class ToneTest:
             return ""
         return (
             f"tone curve: the ground's shading fits {best} better than the sRGB curve that was assumed "
-            f"(residual {100 * self.residuals[best]:.2f} % against {100 * self.residuals['sRGB']:.2f} %): lights "
+            f"(not explained: {100 * self.residuals[best]:.2f} % against {100 * self.residuals['sRGB']:.2f} %): lights "
             "may be off by some 5 % of their distance. Switch HDR and photo styles off, or take RAW photos"
         )
 

@@ -130,9 +130,10 @@ def _apart_finding(path: Path, more: float, limit: float) -> Finding:
     """Return the finding for a photo whose shadows differ from those of the others."""
     than = "of the usual light {} than other photos have at the same places"
     if more > 0:
-        text = f"shadows have {more:.1%} {than.format('more')}, {limit:.1%} may be: was a lamp or a door open?"
+        text = f"shadows have {more:.1%} {than.format('more')}, at most {limit:.1%} is fine: was a lamp or a door open?"
         return Finding(path, "ambient light", text, more, limit, more > SPOILT)
-    text = f"shadows have {-more:.1%} {than.format('less')}, {limit:.1%} may be: exposed less, which the file does not "
+    text = f"shadows have {-more:.1%} {than.format('less')}, at most {limit:.1%} is fine: exposed less, "
+    text += "which the file does not "
     return Finding(path, "exposure changed", f"{text}tell? Lock the exposure next time", more, limit, False)
 
 
@@ -156,6 +157,8 @@ def shadow_findings(stack: PhotoStack, good: Sequence[bool], dark: PhotoStack | 
         elif everywhere and good[k]:
             own = np.isfinite(level)
             text = f"shadows{'' if own else ' of the other photos'} have {level if own else middle:.1%} of the usual "
-            text += f"light, {ROOM_LIGHT:.0%} may be: darken the room, or add photos without flashlight in dark/"
+            text += (
+                f"light, at most {ROOM_LIGHT:.0%} is fine: darken the room, or add photos without flashlight in dark/"
+            )
             found.append(Finding(path, "ambient light", text, level if own else middle, ROOM_LIGHT, False))
     return found

@@ -98,7 +98,7 @@ def board_findings(stack: PhotoStack, indices: Sequence[int], home: HomeView) ->
     for k in home.members.tolist():
         path = stack.paths[indices[k]]
         text = f"the view lies {length * to_file:.1f} px off that of {named_apart(home.board, path)}, the photo of the "
-        text += f"board, {limit * to_file:.1f} px may be: did the tripod move in between?"
+        text += f"board, at most {limit * to_file:.1f} px is fine: did the tripod move in between?"
         found.append(Finding(path, BOARD_OFF, text, length * to_file, limit * to_file, False))
     return found
 

@@ -70,7 +70,7 @@ def view_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack |
             found.append(_moved(stack, path, float(home.lengths[k]), float(limits[k]), *home.fault(path)))
         elif (share := _hidden_share(view, k, shown[k], steady)) > COVERED:
             text = f"something that the other photos do not show covers at least {share:.0%} of the picture"
-            found.append(Finding(path, "covered", f"{text}, {COVERED:.0%} may be", share, COVERED, True))
+            found.append(Finding(path, "covered", f"{text}, at most {COVERED:.0%} is fine", share, COVERED, True))
         elif sharpness[k] < SMEARED:
             text = (
                 f"its sharpest edges are {sharpness[k]:.2f} times as steep as in the other photos, {SMEARED:.2f} needed"
@@ -152,7 +152,8 @@ def _is_explained(home: HomeView, photo: int, steady: Bool[np.ndarray, "rows col
 
 def _moved(stack: PhotoStack, path: Path, length: float, limit: float, kind: str, whom: str) -> Finding:
     to_file = stack.full_width / stack.rgb.shape[2]
-    text = f"the view lies {length * to_file:.1f} px off {whom}, {limit * to_file:.1f} px may be: did the tripod move?"
+    text = f"the view lies {length * to_file:.1f} px off {whom}, at most {limit * to_file:.1f} px is fine: "
+    text += "did the tripod move?"
     return Finding(path, kind, text, length * to_file, limit * to_file, True)
 
 

@@ -69,7 +69,7 @@ def _brightness_findings(stack: PhotoStack, dark: PhotoStack | None) -> list[Fin
         saturated = float((largest_channel(rgb) * gain >= SATURATED).mean())
         if saturated > OVER_EXPOSED_WARN:
             drop = saturated > OVER_EXPOSED_DROP
-            text = f"{saturated:.0%} of the pixels are saturated, {OVER_EXPOSED_DROP:.0%} may be: expose less"
+            text = f"{saturated:.0%} of the pixels are saturated, at most {OVER_EXPOSED_DROP:.0%} is fine: expose less"
             limit = OVER_EXPOSED_DROP if drop else OVER_EXPOSED_WARN
             found.append(Finding(path, "over-exposed", text, saturated, limit, drop))
     return found

@@ -158,7 +158,8 @@ def next_words(lights: tuple[SeenLight, ...], missing: tuple[int, ...]) -> str:
     if np.ptp(np.percentile(heights, [10, 90])) < SPREAD:
         return f"Next: hold the light {'lower' if np.median(heights) > 40 else 'higher'}; so far all are at one height."
     if len(lights) < ADVISED_LIT:
-        return f"All sides are lit. {ADVISED_LIT - len(lights)} more photos, with the light in between, make it solid."
+        more = ADVISED_LIT - len(lights)
+        return f"All sides are lit. {more} more photos, with the light in between, make the shape surer."
     if len(lights) < PLENTY:
         return "That is enough. Every further photo with the light in a new place makes it finer."
     return "Done: light from all sides and heights. More photos add little."

@@ -49,8 +49,7 @@ class Readiness:
         """The verdict in one sentence."""
         used, photos = self.facts["photos_used"], self.facts["photos"]
         if len(self.reasons) == 0:
-            gap = self.facts["widest_gap_deg"]
-            return f"Good: {used} of {photos} photos usable, light from all around (largest gap {gap:.0f} degrees)."
+            return f"Good: {used} of {photos} photos can be used, and light came from all sides."
         more = f" (and {len(self.reasons) - 1} more)" if len(self.reasons) > 1 else ""
         return f"{self.grade.capitalize()}: {self.reasons[0]}{more}."
 
@@ -187,7 +186,7 @@ def judge_photos(say: Judge, facts: dict[str, Any], findings: Sequence[Finding],
     warned = Counter(finding.kind for finding in findings if not finding.drop)
     for kind, count in warned.items():
         if kind == "over-exposed" and count > MANY_DROPPED * photos:
-            say("fair", f"{count} photos are over-exposed in parts", "Expose less: clipped places tell nothing.")
+            say("fair", f"{count} photos are over-exposed in parts", "Expose less: what is pure white tells nothing.")
         if kind == "ambient light" and count > MANY_DROPPED * photos:
             reason = f"room light brightens the shadows in {count} of {photos} photos"
             say("fair", reason, "Darken the room, or photograph it without flashlight too (dark/).")
@@ -204,7 +203,9 @@ def _judge_tripod(say: Judge, used: int, findings: Sequence[Finding]) -> None:
     first, last = (finding.photo.name for finding in (findings[0], findings[-1]))
     which = f"{len(findings)} photos, {first} to {last}," if len(findings) > 1 else f"1 photo, {first},"
     by, limit = max(finding.value for finding in findings), min(finding.limit for finding in findings)
-    reason = f"the tripod moved: {which} lie up to {by:.0f} px off the photo of the board ({limit:.1f} px may be)"
+    reason = (
+        f"the tripod moved: {which} lie up to {by:.0f} px off the photo of the board (at most {limit:.1f} px is fine)"
+    )
     if findings[0].drop:
         reason += f" and are left out, {used} photos with the board's view are used"
         say("poor", reason, f"{BOARD_AGAIN}; they are then the ones that count.")

@@ -95,14 +95,12 @@ def _shading_facts(
 
 def _judge_shading(say: Judge, facts: dict[str, Any]) -> None:
     if facts["light_spread"] < FLAT:
-        reason = (
-            f"the lights lie within {np.degrees(np.arcsin(facts['light_spread'])):.0f} degrees (rms) of one plane, "
-        )
+        reason = f"the lights lie within {np.degrees(np.arcsin(facts['light_spread'])):.0f} degrees of one plane, "
         reason += f"{np.degrees(np.arcsin(FLAT)):.0f} are needed: slopes across it are guessed"
         say("poor", reason, MORE_LIGHTS)
     if facts["clipped_share"] > CLIPPED:
-        reason = f"{facts['clipped_share']:.0%} of what shows the object is clipped, at most {CLIPPED:.0%} may be"
-        say("fair", reason, "Expose less: clipped places tell nothing.")
+        reason = f"{facts['clipped_share']:.0%} of what shows the object is pure white, at most {CLIPPED:.0%} may be"
+        say("fair", reason, "Expose less: what is pure white tells nothing.")
     if facts["dark_share"] > MANY_DARK:
         reason = f"{facts['dark_share']:.0%} of what shows the object is nearly black, at most {MANY_DARK:.0%} advised"
         say("fair", reason, "Expose longer, or hold the lights nearer to the camera's side.")

@@ -172,14 +172,14 @@ def _solved(blocks: _Blocks, on_progress: Callable[[int, str], None]) -> Detail:
     for done, (part, samples, albedo, pixel_gloss) in enumerate(blocks, 1):
         about = albedo.mean(-1).clamp(min=LEAST_ALBEDO)
         normals[part], trust[part] = fit_detail(samples, about, noise, pixel_gloss)
-        on_progress(done, f"normals of {min(done * PIXELS_AT_ONCE, len(trust)) / 1e6:.2f} million pixels")
+        on_progress(done, f"relief of {min(done * PIXELS_AT_ONCE, len(trust)) / 1e6:.2f} million pixels")
     trust *= torch.from_numpy(seen.inner)
     normals = merged(seen, normals, trust, blocks.fields.grid.spacing)
     colour, share = torch.empty_like(normals), torch.empty(len(seen.index))
     for done, (part, samples, _, pixel_gloss) in enumerate(blocks, 1):
         colour[part], photos = fit_albedo(samples, normals[part], pixel_gloss)
         share[part] = (photos / ENOUGH_PHOTOS).clamp(0, 1)
-        on_progress(total + done, f"albedo of {min(done * PIXELS_AT_ONCE, len(trust)) / 1e6:.2f} million pixels")
+        on_progress(total + done, f"colours of {min(done * PIXELS_AT_ONCE, len(trust)) / 1e6:.2f} million pixels")
     confidence = torch.from_numpy(seen.inner) * share
     gain = _gain(blocks, colour, confidence) if blocks.fields.view else torch.ones(CHANNELS)
     for part in _blocks(seen):

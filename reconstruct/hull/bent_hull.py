@@ -100,7 +100,9 @@ class BentHull:
         scene, observer = self.scene, self.observer
         rounds = SHADING_ROUNDS if scene.rgb is not None else LIT_ROUNDS
         for number in range(rounds):
-            self.say(f"bending the hull to the normals that the photos show, round {number + 1} of at most {rounds}")
+            self.say(
+                f"bending the first shape to the slopes that the photos show, round {number + 1} of at most {rounds}"
+            )
             if number:
                 labels = labels if scene.rgb is None else observer.labels(hull, scene)
                 labels = observer.with_normals(labels, hull, scene)

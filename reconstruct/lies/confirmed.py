@@ -93,7 +93,7 @@ def confirmed(
     known = {lie.name: lie for lie in lies}
     kept, refused, start, was_refined = together.placed, list(together.refused), together.start, False
     while kept:
-        say("asking if the lies agree on one surface")
+        say("comparing the object's surface in all its positions")
         start = solve(kept, start)
         met = [how_met(lies[0], start, STILL, seed)]
         met += [how_met(known[one.name], start, one.motion, seed) for one in kept]

@@ -71,8 +71,8 @@ class PlacedLie:
         kept = "refined on its rays" if self.trial.is_kept else "as found"
         return (
             f"{self.name}: how the object was turned was found {how}; the surfaces are {self.alignment.distance:.2g} "
-            f"mm apart (median). The motion is {kept}: held-out rays are off by {100 * self.trial.after:.3g} % refined "
-            f"and {100 * self.trial.before:.3g} % before"
+            f"mm apart (median). The motion is {kept}: of the shadows set aside {100 * self.trial.after:.3g} % are "
+            f"wrong after refining and {100 * self.trial.before:.3g} % before"
         )
 
 

@@ -113,7 +113,7 @@ def _reconstruct(
 ) -> None:
     """Do the stages after the calibration: check, solve, mesh, detail, report.json."""
     if source.session is not None and source.ground_is_known(options) and not run.is_finished("solve"):
-        done_once(run, "check", "judging the capture", lambda: _check(source, run, photos, calibration), needs=photos)
+        done_once(run, "check", "judging the photos", lambda: _check(source, run, photos, calibration), needs=photos)
     solved = once(
         run,
         "solve",
@@ -129,14 +129,14 @@ def _reconstruct(
     is_new = done_once(
         run,
         "mesh",
-        "extracting the mesh",
+        "making the mesh",
         lambda: _save(mesh.get(), solved.get(), calibration.get(), run),
     )
     if detail_is_asked(source, options):
         is_new |= done_once(
             run,
             "detail",
-            "reading normals and albedo from the whole photos",
+            "reading relief and colours from the whole photos",
             lambda: write_detail(source, options, run, photos.get(), calibration.get(), solved.get()),
             needs=photos,
         )

@@ -221,9 +221,9 @@ def misfit(numbers: dict[str, float]) -> list[str]:
     if error < MISFIT:
         return []
     return [
-        f"the surface does not explain its photos: held-out shadow rays are off by {100 * error:.0f} % (below "
-        f"{100 * MISFIT:.0f} % was needed, 1 % is usual). Do not trust this shape: lights, ground or the object's mask "
-        "are wrong. Look at the lights in report.html."
+        "the surface does not explain its photos: shadows that were set aside for a test are wrong by "
+        f"{100 * error:.0f} % (below {100 * MISFIT:.0f} % was needed, 1 % is usual). Do not trust this shape: lights, "
+        "ground or the object's mask are wrong. Look at the lights in report.html."
     ]
 
 

@@ -53,7 +53,7 @@ class RequestSteering:
         """Return True if a visitor asked to end this level, or to stop."""
         if NEXT_LEVEL in open_requests(self._run.path):
             withdraw(self._run.path, NEXT_LEVEL)
-            self._run.remark(f"{ON_REQUEST}the level ends here")
+            self._run.remark(f"{ON_REQUEST}this round ends here")
             return True
         return self.is_stopped()
 
@@ -72,10 +72,10 @@ class RequestSteering:
             return False
         new = self._continued(config, state.level, asked[-1])
         if new is not None and new != config:
-            self._run.remark(f"{ON_REQUEST}going on as {asked[-1]} after level {state.level}")
+            self._run.remark(f"{ON_REQUEST}going on as {asked[-1]} after round {state.level}")
             raise Rescheduled(state, new, asked[-1])
         if new is None and state.level < len(config.levels):
-            self._stop(f"ended after level {state.level}, as fine as {asked[-1]}")
+            self._stop(f"ended after round {state.level}, as fine as {asked[-1]}")
         return self.was_stopped
 
     def _stop(self, how: str) -> None:

@@ -106,7 +106,7 @@ def fit(
         Rescheduled: by `steering`.
     """
     solved = _solved(each(scene), config, report, checkpoint, device, steering, earlier, say)
-    say("reading albedo and gloss from the photos, and asking if the lights agree with each other's shadows")
+    say("reading albedo and gloss from the photos, and comparing each light with the shadows under the others")
     found = _fields(solved.observers, solved.lit, solved.rays, solved.begin, solved.surface)
     return as_stored(replace(found, light_trial=solved.state.verdict))
 
@@ -260,7 +260,7 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, tup
         task.steering.wait(writer.write)
     found, shift, verdict = stopping.chosen(surface.grid()), lights.shift, state.verdict
     if is_tried:
-        task.say("trying the refined lights against the calibrated ones")
+        task.say("comparing the moved lights with the first ones")
         unmoved = no_shift(scenes)
         verdict, found = try_lights(replace(level_fit, level=level), found, shift, unmoved, task.device)
         shift = shift if verdict.is_accepted else unmoved

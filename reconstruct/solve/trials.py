@@ -143,7 +143,7 @@ def shadow_doubts(
             continue
         doubts.append(
             f"{scene.view + ': ' if scene.view else ''}the surface contradicts {100 * share:.0f} % of the shadow that "
-            f"was held out (edges not counted; below {100 * CONTRADICTED:.0f} % was needed, 1 % is usual). "
+            f"was set aside for a test (edges not counted; below {100 * CONTRADICTED:.0f} % was needed, 1 % is usual). "
             "Do not trust this shape: the lights, the ground or the object's outline are wrong, or the object is too "
             "thin for these pictures. Compare the shadows in report.html; give a mask, or larger pictures."
         )

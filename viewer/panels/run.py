@@ -24,17 +24,17 @@ AS_PLANNED = "as planned"
 SOLVING = ("hull", "solve")  # stages that can be steered; before them a request waits
 ASKED = {
     PAUSE: "a pause",
-    NEXT_LEVEL: "the next level",
+    NEXT_LEVEL: "to go on finer",
     STOP: "stop and save",
-    "draft": "draft from the next level on",
-    "standard": "standard from the next level on",
-    "fine": "fine from the next level on",
+    "draft": "draft from the next round on",
+    "standard": "standard from the next round on",
+    "fine": "fine from the next round on",
 }
 HINTS = {
     PAUSE: "The run waits and uses no processor; Go on continues it",
-    NEXT_LEVEL: "End this level now and go on with the next, finer one",
+    NEXT_LEVEL: "End this round now and go on with the next, finer one",
     STOP: "Make a mesh of the surface so far; the same command continues from here later",
-    AS_PLANNED: "The resolution of the rest of the run, from the next level on",
+    AS_PLANNED: "The resolution of the rest of the run, from the next round on",
 }
 
 
@@ -49,7 +49,7 @@ class RunPanel:
             self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE, hint=HINTS[PAUSE])
             self._go_on = gui.add_button("Go on", icon=viser.Icon.PLAYER_PLAY, visible=False)
             self._next = gui.add_button(
-                "Next level", icon=viser.Icon.PLAYER_TRACK_NEXT, color=QUIET, hint=HINTS[NEXT_LEVEL]
+                "Finer now", icon=viser.Icon.PLAYER_TRACK_NEXT, color=QUIET, hint=HINTS[NEXT_LEVEL]
             )
             self._stop = gui.add_button("Stop and save", icon=viser.Icon.DEVICE_FLOPPY, color=QUIET, hint=HINTS[STOP])
             choices = (AS_PLANNED, *RESOLUTIONS)

@@ -18,7 +18,7 @@ from viewer.report.figures import coverage, curves, lights_from_above
 
 EXPLANATION = (
     "While the surface is fitted, uncertain lights may move to fit the shadows. The moved lights are kept only if they "
-    "explain shadows held out of the fit better than the calibrated lights do."
+    "explain shadows that were set aside for a test better than the first ones do."
 )
 
 

@@ -18,7 +18,7 @@ _RULES = (
     (r"Put it into board/, or name it in session\.toml: roles = \{[^}]*\}", 'Choose "board" below its picture'),
     (r"and put (the|that) photo into board/", 'and choose "board" below its picture'),
     (r"Put (it|one) into (its folder )?board/", 'Choose "board" below its picture'),
-    (r"Put them into its folder light/", 'Choose "light\'s phone" below their pictures'),
+    (r"Put them into its folder light/", 'Choose "flashlight\'s phone" below their pictures'),
     # photos
     (r"Remove it from the folder, or copy the photo again", "Copy the photo again"),
     (r" Remove it from the folder\.", ""),
@@ -28,7 +28,7 @@ _RULES = (
     (r"Give a file with a line for each: --lights FILE", "Drop a file of lights with the photos"),
     (r"give the directions with --lights FILE", "drop a file of lights with the photos"),
     (r"Name one with --lights, or remove the others", "Leave one"),
-    (r", or use --lights shading", ', or choose "as it looks" for those photos'),
+    (r", or use --lights shading", ', or choose "found from the picture" for those photos'),
     (r" needed for --lights phone", " needed"),
     (r"Add them, or leave --lights out", "Add them, or leave the file out"),
     (r", or give --light-error [\d.]+, which lets the lights move", ""),

@@ -31,7 +31,7 @@ export function usePanel(redraw) {
   byId("save-page").disabled = Boolean(served.saves);
   if (served.saves) byId("save-page").title = "Export the page instead: it then holds all its parts.";
   if (served.home) {
-    const link = Object.assign(document.createElement("a"), { href: served.home, textContent: "The solver's view of this run" });
+    const link = Object.assign(document.createElement("a"), { href: served.home, textContent: "Inspect this run in 3D" });
     byId("home-link").append(link);
   }
   lightControls();

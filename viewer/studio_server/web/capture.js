@@ -7,7 +7,7 @@ import { phones } from "./phones.js";
 import { Sender, complaint, dropped, picked, sending } from "./upload.js";
 import { voice } from "./voice.js";
 
-const ROLES = { "": "as it looks", board: "board", lit: "flashlight", light: "light's phone", dark: "light off", side: "side photo" };
+const ROLES = { "": "found from the picture", board: "board", lit: "flashlight", light: "flashlight's phone", dark: "light off", side: "side photo" };
 const senders = new Map(); // they go on while another view is shown
 
 export function capture(name, again) {
@@ -89,7 +89,7 @@ export function capture(name, again) {
       h("select", { "aria-label": `What ${photo.name} shows`, value: photo.role, onchange: (event) => attempt(async () => {
         await change("role", { key: row.key, photo: photo.name, role: event.target.value });
         again();
-      }) }, Object.entries(ROLES).map(([role, words]) => h("option", { value: role, selected: role === photo.role }, role === "" && photo.looked ? "to be told" : words))),
+      }) }, Object.entries(ROLES).map(([role, words]) => h("option", { value: role, selected: role === photo.role }, role === "" && photo.looked ? "not clear yet" : words))),
       h("button", { "aria-label": `Delete ${photo.name}`, onclick: () => attempt(async () => {
         await change("delete_photo", { key: row.key, photo: photo.name });
         toast(`${photo.name} is in the trash.`);
@@ -129,7 +129,7 @@ export function capture(name, again) {
     const isPending = check.is_running || (check.is_old && row.photos.length + row.clips.length > 4);
     return h("section", { class: "panel", "aria-live": "polite" }, h("h2", {}, "Are the photos good?"),
       row.photos.length + row.clips.length === 0 && h("p", { class: "quiet" }, "Photos first: 15 to 40 of the object, each with the light elsewhere."),
-      isPending && h("p", { class: "quiet" }, check.is_running ? "Looking at all photos together." : "Waits for the photos to pause."),
+      isPending && h("p", { class: "quiet" }, check.is_running ? "Looking at all photos together." : "Waits until no more photos arrive."),
       check.sentence && h("p", { class: `verdict ${check.verdict}` }, check.sentence),
       !check.sentence && check.error && failure(check.error),
       check.advice.length > 0 && h("div", {}, h("h3", {}, "Shoot next"), h("ul", { class: "plain" }, check.advice.map((text) => h("li", {}, text)))),
@@ -155,7 +155,7 @@ export function capture(name, again) {
       h("button", { class: "main", disabled: row.photos.length + row.clips.length === 0 || sender.open.length > 0 || row.coming > 0, onclick: () => start(row) }, "Start"),
       row.photos.length + row.clips.length === 0 ? h("p", { class: "quiet small" }, "Photos first.")
         : (sender.open.length > 0 || row.coming > 0) && h("p", { class: "quiet small" }, "Starts once all photos are here."),
-      row.check.verdict === "hopeless" && h("p", { class: "warn small" }, "The verdict says that this will not work; a run ends with its sentence."));
+      row.check.verdict === "hopeless" && h("p", { class: "warn small" }, "These photos will not do, as the verdict says: a run would stop there."));
   }
 
   const start = (row) => attempt(async () => {

@@ -190,7 +190,7 @@ export function size(row) {
 export const PRESETS = {
   draft: ["A first look", "Coarse, to see whether the photos are good."],
   standard: ["The usual", "A solid model with its colours."],
-  fine: ["All that the photos hold", "A finer grid, and normals of every pixel."],
+  fine: ["All that the photos hold", "Finer, with the relief of every pixel; takes longest."],
 };
 export const presetWords = (name) => (PRESETS[name] ? PRESETS[name][0] : name);
 

@@ -12,7 +12,7 @@ export function phones(capture, again) {
   return {
     refresh,
     button: () => h("button", { "aria-pressed": String(row.on && row.capture === capture), onclick: () => (row.on && row.capture === capture ? turn("send_away", {}) : turn("let_in", { key: capture })) },
-      row.on && row.capture === capture ? "Send phones away" : "Let phones in"),
+      row.on && row.capture === capture ? "Disconnect phones" : "Let phones in"),
     panel: () => {
       if (!row.on || row.capture !== capture) return null;
       const address = isLive ? row.live_address : row.address;
@@ -25,7 +25,7 @@ export function phones(capture, again) {
             h("label", {}, h("input", { type: "checkbox", checked: isLive, onchange: (event) => { isLive = event.target.checked; again(); } }),
               " Live camera (https). The phone warns, because this machine signs for itself: choose Advanced, then Proceed."),
             row.phones.length === 0 && h("p", {}, "No phone yet."),
-            row.phones.length > 0 && h("ul", { class: "plain" }, row.phones.map((one, k) => h("li", {}, `Phone ${k + 1} (${one.name})${ROLES[one.role] || ""}${one.is_here ? "" : ", away: its photos go on when it is back"}`))),
+            row.phones.length > 0 && h("ul", { class: "plain" }, row.phones.map((one, k) => h("li", {}, `Phone ${k + 1} (${one.name})${ROLES[one.role] || ""}${one.is_here ? "" : ", not connected: it goes on sending when it is back"}`))),
             row.phones.some((one) => one.role === "camera") && h("button", { class: "main", onclick: () => turn("shoot", {}) }, "Take a photo"),
             h("p", { class: "small quiet" }, `Closes by itself in ${duration(row.left_s)}.`))));
     },

@@ -6,7 +6,7 @@ import { about, attempt, bytes, change, duration, h, key, presetWords } from "./
 export function queue(jobs, again) {
   if (!jobs.length) return null;
   const lefts = jobs.map((job) => job.left_s), isKnown = lefts.every((left) => left !== null && left !== undefined);
-  const told = isKnown ? `all done in ${about(lefts.reduce((sum, left) => sum + left, 0))}` : "how long they take is being found out";
+  const told = isKnown ? `all done in ${about(lefts.reduce((sum, left) => sum + left, 0))}` : "how long they take is not known yet";
   const act = (job, action) => attempt(async () => { await change("queue", { job: job.id, action }); again(); });
   return h("section", { class: "panel queue", key: "queue" }, h("h2", {}, "At work"),
     h("p", { class: "quiet" }, `One run at a time, ${jobs.length} in the queue; ${told}.`),
