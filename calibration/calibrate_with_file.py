@@ -100,7 +100,7 @@ def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> 
     notes = [*found.residuals.get("notes", []), f"lights: {len(opinions)} of {len(lights)} also from {path}"]
     if apart:
         notes.append(
-            f"photos and {path} contradict each other about {', '.join(apart)}: check its axes and how exact it says it is"
+            f"photos and {path} contradict each other about {', '.join(apart)}: check its axes and its exactness"
         )
     return replace(found, lights=tuple(lights), residuals=found.residuals | {"notes": notes})
 

@@ -58,7 +58,7 @@ def test_a_surface_that_lacks_a_part_is_doubted_and_the_true_one_is_not(table):
     rays = replace(rays, confidence=np.zeros_like(rays.confidence))  # as if all were held out
     assert shadow_doubts((scene,), (observer,), (rays,), of(TABLE, truth)) == ()
     (doubt,) = shadow_doubts((scene,), (observer,), (rays,), of((TOP, *LEGS), truth))
-    assert "of the shadow that was held out" in doubt and "below 4 %" in doubt
+    assert "of the shadow that was set aside for a test" in doubt and "below 4 %" in doubt
 
 
 @pytest.mark.slow  # two small solves
