@@ -116,6 +116,7 @@ def test_a_strangers_entry_of_the_scale_is_left_out(entry):
         (Optics(1.57, 13.0), 6.5),  # a phone's wide lens, which does macro
         (Optics(6.9, 24.0), 102.1),
         (Optics(50.0, 75.0), 100.0),  # a larger camera, at life size
+        (Optics(70.0), 140.0),  # which one it is, its focal length alone tells
     ],
 )
 def test_how_near_a_lens_is_sharp_follows_from_its_focal_length(optics, closest):

@@ -19,9 +19,9 @@ from capture.decode.exif import Optics
 
 STAMP_MM = 40.0  # longer side of a large stamp; a bank card, the smallest board that is offered, has 85.6
 LARGEST_MM = 1189.0  # longer side of A0, the largest sheet that printers take
-# Between where EXIF says that the focus is and where the board is. A phone (5.6 mm, f/1.8) focused at 0.6 m is sharp
-# from 0.5 to 0.8 m, and its motor moves in steps as coarse; a slip of the unit is 10 or more.
-FOCUS_OFF = 2.0
+# Between where EXIF says that the focus is and where the board is: nearer to a slip of the unit, which is 10 or more,
+# than to none. A Pixel XL stated 0.29 m for boards at 0.34, 0.38 and 0.59 m.
+FOCUS_OFF = 10**0.5
 MARKER_OFF = 0.05  # of a square: a millimetre of twenty; blur and lens change a marker's width by less than half of it
 UNITS = {"centimetres": 10.0, "inches": 25.4, "metres": 1000.0}
 AS_TYPED, AS_PRINTED, AS_CUT, ASSUMED = (

@@ -16,6 +16,7 @@ ORDINARY_FOCAL_35MM = 27.0  # mm, of photos that do not tell theirs: main camera
 ORDINARY_FOCAL_MM = 5.6  # of such a camera, on its sensor of 1/1.7 inch
 PHONE_STROKE_MM = 0.5  # how far the focus motors of phones move a lens: 0.3 to 0.5 mm
 SMALL_SENSOR = 2.5  # full frame's diagonal over the sensor's; the largest in phones, of 1 inch, has 2.7
+LONGEST_MAIN_MM = 10.0  # focal length: main cameras of phones have 4 to 9 mm
 FAR_AWAY = 1e6  # mm: files write infinity as a huge number
 FRONT = re.compile(r"\b(front|truedepth|selfie)\b", re.IGNORECASE)  # in the lens names of phones
 
@@ -50,7 +51,7 @@ class Optics:
         cameras have lenses that show things in life size: at 2 f.
         """
         focal = self.focal_mm or ORDINARY_FOCAL_MM
-        is_phone = self.focal_mm is None or (self.focal_35mm or 2 * SMALL_SENSOR * focal) / focal > SMALL_SENSOR
+        is_phone = self.focal_35mm / focal > SMALL_SENSOR if self.focal_35mm else focal < LONGEST_MAIN_MM
         return focal + focal**2 / PHONE_STROKE_MM if is_phone else 2 * focal
 
     def words(self) -> str:
