@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from board_photos import board_photo, look_at
+from fake_run import make_truth
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
@@ -16,6 +18,7 @@ from calibration.board.board_scale import scale_doubts, scale_of, scale_parts, s
 from calibration.camera import Camera
 from capture.decode.exif import Optics, optics_of
 from capture.session.session import Session, SessionSettings
+from viewer.report.pictures import size_facts
 
 CAMERA = Camera(1200, 900, 1000.0, 1000.0, 599.5, 449.5)
 BOARD = Board("charuco", 5, 7, 30.0, 22.0, "DICT_4X4_50")
@@ -102,6 +105,14 @@ def test_a_board_of_its_true_size_is_not_doubted_whatever_the_file_says(tmp_path
 )
 def test_what_every_length_rests_on_is_one_sentence(spec, is_named, said):
     assert said in scale_sentence({"scale": scale_of(parse_board(spec), is_named)})
+
+
+@pytest.mark.parametrize("square", [22.0, 30.0, 2.2])
+def test_the_report_says_it_beside_the_size(square):
+    truth = make_truth(width=64, n_lights=4).calibration
+    rests_on = scale_of(Board("checkerboard", 9, 6, square), True)
+    facts = size_facts(trimesh.creation.box((40, 30, 20)), replace(truth, residuals={"scale": rests_on}))
+    assert facts[1] == (f"one square = {square:g} mm", "Every length rests on this, as you typed it. Measure it.")
 
 
 @pytest.mark.parametrize("entry", [None, 3, {"length": 1, "from": "x"}, {"length": "x"}])

@@ -57,7 +57,7 @@ def size_facts(mesh: trimesh.Trimesh, calibration: Calibration | None) -> list[t
         out.append(_volume_fact(mesh))
     scale = None if calibration is None else scale_parts(calibration.residuals)
     if scale:
-        out.append((scale[0], f"Every length rests on this, {scale[1]}. Measure it."))
+        out.insert(1, (scale[0], f"Every length rests on this, {scale[1]}. Measure it."))
     return out
 
 
