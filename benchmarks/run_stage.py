@@ -59,7 +59,9 @@ def picture(tab, look: str) -> np.ndarray:
 
 def filled(tab, window: dict[str, int]) -> float:
     """The larger side of the object's box over the window's shorter side."""
-    tab.evaluate("for (const e of document.querySelectorAll('header, #panel, #modes, #bar')) e.style.display = 'none'")
+    tab.evaluate(
+        "for (const e of document.querySelectorAll('header, #panel, #modes, #tools, #bar')) e.style.display = 'none'"
+    )
     there = np.abs(picture(tab, "normals") - picture(tab, "photo")).sum(-1) > DIFFERS
     rows, columns = np.flatnonzero(there.any(1)), np.flatnonzero(there.any(0))
     return max(np.ptp(rows), np.ptp(columns)) / min(window.values())

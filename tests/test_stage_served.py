@@ -40,6 +40,8 @@ def test_page_and_parts_are_served_and_nothing_else_of_the_folder(address):
     assert status == 200 and b"heap" in page and b"connect-src 'self'" in page
     assert asked(address, "/stage/scene.bin")[0] == 200
     assert asked(address, "/stage/object.jpg")[1][:2] == b"\xff\xd8"
+    whole = asked(address, "/stage/share.html")[1]
+    assert b"connect-src 'none'" in whole and b'"block":"data:' in whole and b'"saves":""' in whole
     for path in ("/stage/report.json", "/stage/../report.json", "/stage/%2e%2e/mesh.ply", "/stage/mesh.ply"):
         assert asked(address, path)[0] == 404
     assert asked(address, "/stage/", Host="evil.example")[0] == 403

@@ -10,23 +10,22 @@ from jaxtyping import Bool, Float, UInt8, UInt32
 from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial import KDTree
 
-from calibration.light import Light
-from calibration.posed_camera import PosedCamera
-from capture.photos.photo import decode_srgb, encode_srgb
+from capture.photos.photo import encode_srgb
 from reconstruct.detail.file import SURE, UNIT, Detail
 from reconstruct.fields import Fields
 from reconstruct.mesh.evidence import SEEN
 from reconstruct.mesh.mesh import vertex_colours
 from reconstruct.mesh.simplify import simplified
-from reconstruct.render.g_buffer import RenderView, SeenMaterial, gloss_at, seen_material, surface_maps
-from reconstruct.render.studio import Studio, lit
+from reconstruct.render.g_buffer import SeenMaterial, gloss_at, seen_material, surface_maps
+from reconstruct.render.soft_light import SoftLight, ground_sky, soft_light
+from reconstruct.render.studio import studio_of
 from reconstruct.stored_run.stored_run import StoredRun
 
 MOST_FACES = 150_000  # a phone draws them sixty times a second, and so does a software renderer twenty times
 MOST_GLOSSY = 4  # materials: the weights of one vertex are one texel
 PICTURE_SIDE = 1024  # px, the longer side of the pictures that a page opens with
 MARGIN = 4  # px of the working picture around the object
-SOFT = 3  # shadow rays per pixel of a picture that stands for a moment
+GROUND_HALF = 4.0  # radii of the object: farther out, it hides less than a hundredth of the sky from the ground
 FULL_WEIGHT = 255  # stored for the largest weight of a glossy material
 
 
@@ -46,6 +45,8 @@ class StageScene:
     normal_picture: UInt8[np.ndarray, "height width 3"] | None  # (n + 1) / 2 on the same window; with a detail only
     ground_picture: UInt8[np.ndarray, "rows columns 3"]  # the whole photo's; filled where the object hides it
     ground_mean: UInt8[np.ndarray, "3"]
+    soft: SoftLight  # at the vertices
+    ground_sky: Float[np.ndarray, "side side"]  # the sky's share on a square of ground of GROUND_HALF radii
 
 
 def stage_scene(run: StoredRun) -> StageScene:
@@ -65,12 +66,14 @@ def stage_scene(run: StoredRun) -> StageScene:
     maps = surface_maps(fields.grid, fields.posed_camera)
     mask, finite = maps.mask.numpy(), torch.isfinite(maps.depth).numpy()
     ground = np.asarray(binary_erosion(finite & ~mask, np.ones((3, 3), bool), border_value=1), bool)
-    gloss, scale = _gloss(fields, vertices, seen_material(fields))
+    material, studio = seen_material(fields), studio_of(np.asarray(mesh.bounds))
+    gloss, scale = _gloss(fields, vertices, material)
+    normals, is_whole = _normals(fields, small), any(one.object_from_world is not None for one in fields.further)
     picture, window, normal_picture = _object_pictures(fields, mask, run.detail)
     whole, mean = ground_pictures(fields.albedo.numpy(), ground)
     return StageScene(
         vertices,
-        _normals(fields, small),
+        normals,
         vertex_colours(small)[:, :3],
         np.asarray(evidence, np.uint8),
         gloss,
@@ -81,34 +84,9 @@ def stage_scene(run: StoredRun) -> StageScene:
         normal_picture,
         whole,
         mean,
+        soft_light(fields, material, small, torch.from_numpy(normals).float(), is_whole),
+        ground_sky(fields, studio.centre, GROUND_HALF * studio.radius),
     )
-
-
-def relit_photo(
-    fields: Fields,
-    place: PosedCamera,
-    light: Light,
-    studio: Studio,
-    ground_mean: UInt8[np.ndarray, "3"],
-    background: UInt8[np.ndarray, "3"],
-) -> UInt8[np.ndarray, "height width 3"]:
-    """Return the scene, sRGB, as a camera at the capture camera's centre sees it under a soft lamp, without glows.
-
-    The albedo is the photo's own, which shows all that is seen from there.
-
-    Args:
-        ground_mean: albedo of the ground outside the photo, sRGB.
-        background: where nothing is, sRGB.
-    """
-    maps = surface_maps(fields.grid, place)
-    pixels = fields.posed_camera.project(maps.points.reshape(-1, 3).double().numpy()).astype(np.float32)
-    x, y = (np.ascontiguousarray(pixels[:, k].reshape(maps.depth.shape)) for k in (0, 1))
-    outside = (*decode_srgb(ground_mean).tolist(), 0.0)
-    albedo = cv2.remap(fields.albedo.numpy(), x, y, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, outside)
-    eye = torch.from_numpy(place.centre).float()
-    picture = encode_srgb(lit(RenderView(maps, torch.from_numpy(albedo), fields.grid, eye), light, studio, None, SOFT))
-    picture[~torch.isfinite(maps.depth).numpy()] = background
-    return picture
 
 
 def filled(values: Float[np.ndarray, "height width 3"], known: Bool[np.ndarray, "height width"]) -> np.ndarray:

@@ -20,7 +20,7 @@ from capture.files.json_field import JsonField
 from capture.files.regular import open_regular, read_regular
 
 STAGE_PACK, FACTS = "stage.zip", "facts.json"
-FORMAT = 4
+FORMAT = 5
 LARGEST = 1 << 28  # bytes of the archive
 LARGEST_FACTS = 1 << 22
 MOST_PARTS = 4000

@@ -7,8 +7,8 @@ One idea: what the browser draws is always the same mesh with the same materials
 the photo's: each pixel takes its albedo from the photo's own pixel, by projection, so that the page opens as a relit
 photograph. As the view turns, what the photo does not show takes the colour of the mesh's vertices. Surface and
 material go to a G-buffer when the view changes, depth seen from the lamp to a shadow map when the lamp moves, and one
-full-screen pass lights them. While a hand moves something the picture has fewer pixels; at rest samples of pixel and
-lamp are averaged: edges become smooth and shadows as soft as the lamp is large.
+full-screen pass lights them; what comes from sky and ground was computed before (reconstruct/render/soft_light.py).
+While a hand moves something the picture has fewer pixels; at rest samples of pixel and lamp are averaged.
 
 What cannot be read from the photos is said: where the surface is a guess it can be marked or cut away.
 Notes, saved views, crop and the like are one document, `stage.json` (reconstruct/stored_run/stage_document.py).

@@ -11,20 +11,11 @@ from capture.errors import UserError
 from capture.photos.photo import decode_srgb
 from reconstruct.appearance.brdf import MATERIALS, SHARPNESS, facing_reflectances
 from reconstruct.export.export import UNIT_WORDS, Contents
-from reconstruct.export.stage_scene import FULL_WEIGHT, StageScene
+from reconstruct.export.first_view import LAMP, SKY
+from reconstruct.export.stage_scene import FULL_WEIGHT, GROUND_HALF, StageScene
 from reconstruct.fields import Fields
 from reconstruct.mesh.evidence import KINDS
-from reconstruct.render.studio import (
-    FILL_LIGHT,
-    KEY_DISTANCE,
-    KEY_ELEVATION,
-    KEY_STRENGTH,
-    KEY_TURN,
-    LAMP_RADII,
-    Studio,
-    looking_at,
-    towards,
-)
+from reconstruct.render.studio import KEY_DISTANCE, LAMP_RADII, Studio, looking_at, towards
 from reconstruct.stored_run.stage_pack import FORMAT
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.stage.cameras import camera_facts, light_facts
@@ -33,16 +24,24 @@ from viewer.stage.pack import Block
 BACKGROUND = (24, 26, 31)  # sRGB, as of the page's style
 FADE = (2.5, 7.0)  # radii of the object from its middle, over which ground outside the photo goes into the background
 LARGEST_LAMP = 3.0  # radii of the object
+OUTLINE_WAYS = 200  # 8 degrees apart: an outline is short by less than a hundredth
 FIRST_MARGIN = 1.6  # side of the first picture over the object's larger one
+SIGNS = {"seen": "seen", "shadow": "shadow", "guess": "unconstrained"}  # of the legend, in the page's style
 WORDS = {"seen": "seen in the photos", "shadow": "held by shadows", "unconstrained": "a guess"}
 
 
 def stage_facts(
-    run: StoredRun, studio: Studio, scene: StageScene, block: Block, addresses: Mapping[str, Any]
+    run: StoredRun,
+    studio: Studio,
+    scene: StageScene,
+    block: Block,
+    lamp: tuple[float, float],
+    addresses: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Return what the page's scripts read. World lengths, radians, linear colours.
 
     Args:
+        lamp: azimuth and elevation of the first one, rad.
         addresses: of the parts: "block", "object", "ground", "first", "normals" (or None), "photos" by name, "tiles"
             (or None).
     """
@@ -53,6 +52,7 @@ def stage_facts(
         "unit": UNIT_WORDS[run.unit],
         "size": size_sentence(run),
         "known": known_shares(run),
+        "kinds": {sign: WORDS[kind] for sign, kind in SIGNS.items()},
         "centre": studio.centre.tolist(),
         "radius": studio.radius,
         "bounds": np.asarray(run.mesh.bounds).tolist(),
@@ -61,13 +61,14 @@ def stage_facts(
         "groundMean": decode_srgb(scene.ground_mean).tolist(),
         "background": decode_srgb(np.array(BACKGROUND, np.uint8)).tolist(),
         "fade": list(FADE),
+        "groundHalf": GROUND_HALF,
         "isWhole": any(one.object_from_world is not None for one in fields.further),
         "cameras": [camera_facts(seen, studio) for seen in fields.views()],
-        "box": box_at_home(scene.vertices, fields, studio),
+        "outline": outline_points((scene.vertices - studio.centre) / studio.radius).tolist(),
         "first": first_window(scene.vertices, fields, studio),
-        "lamp": _lamp(fields, studio),
+        "lamp": _lamp(lamp, studio),
         "largestLamp": LARGEST_LAMP * studio.radius,
-        "ambient": FILL_LIGHT,
+        "ambient": SKY,
         "lights": light_facts(run, studio),
         "parts": block.parts,
         "objectWindow": list(scene.object_window),
@@ -112,6 +113,14 @@ def box_at_home(vertices: Float[np.ndarray, "n 3"], fields: Fields, studio: Stud
     return [*slopes.min(0).tolist(), *slopes.max(0).tolist()]
 
 
+def outline_points(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Return the points that reach farthest in any of OUTLINE_WAYS directions: all sides' outlines touch them."""
+    k = np.arange(OUTLINE_WAYS) + 0.5
+    z, turn = 1 - 2 * k / OUTLINE_WAYS, k * np.pi * (3 - np.sqrt(5))  # evenly over the sphere
+    ways = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z])
+    return points[np.unique((points @ ways).argmax(0))]
+
+
 def first_window(vertices: Float[np.ndarray, "n 3"], fields: Fields, studio: Studio) -> list[float]:
     """Return what the first picture shows, as `box_at_home`: a square around the object with some of its ground."""
     left, top, right, bottom = box_at_home(vertices, fields, studio)
@@ -120,13 +129,13 @@ def first_window(vertices: Float[np.ndarray, "n 3"], fields: Fields, studio: Stu
     return [across - half, down - half, across + half, down + half]
 
 
-def _lamp(fields: Fields, studio: Studio) -> dict[str, float]:
+def _lamp(lamp: tuple[float, float], studio: Studio) -> dict[str, float]:
     return {
-        "azimuth": home_view(fields, studio)["azimuth"] + KEY_TURN,
-        "elevation": KEY_ELEVATION,
+        "azimuth": float(lamp[0]),
+        "elevation": float(lamp[1]),
         "distance": KEY_DISTANCE * studio.radius,
         "radius": LAMP_RADII * studio.radius,
-        "strength": KEY_STRENGTH,
+        "strength": LAMP,
     }
 
 

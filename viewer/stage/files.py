@@ -12,6 +12,7 @@ from reconstruct.stored_run.stored_run import FIELDS, MESH
 from viewer.stage.pack_file import is_finished, kind_of, stage_pack, stored_stage
 
 PAGE, DOCUMENT = ("", "index.html"), "stage.json"
+SHARED = "share.html"  # the page in one file, to send
 HTML = "text/html; charset=utf-8"
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -57,7 +58,7 @@ class StageFiles:
         return is_finished(self.run_dir)
 
     def get(self, name: str) -> StageFile | None:
-        """Return the file of this name, "" for the page; None where there is none of it.
+        """Return the file of this name, "" for the page, SHARED for one with all parts in it; None where there is none.
 
         Raises:
             UserError: the run is not finished, or a file of it cannot be used.
@@ -65,11 +66,11 @@ class StageFiles:
         with self._lock:
             pack = self._current(makes=True)
             assert pack is not None
-            if name in PAGE:
+            if name in (*PAGE, SHARED):
                 from viewer.stage.page import page_html
 
-                document = read_stage_document(self.run_dir)
-                page = page_html(title_of(self.run_dir), pack, document, self._saves, self._home)
+                document, how = read_stage_document(self.run_dir), {"saves": self._saves, "home": self._home}
+                page = page_html(title_of(self.run_dir), pack, document, **({} if name == SHARED else how))
                 return StageFile(page.encode(), HTML)
             return StageFile(pack.read(name), kind_of(name)) if name in pack.names else None
 

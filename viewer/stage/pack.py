@@ -33,6 +33,9 @@ def packed(scene: StageScene, centre: Float[np.ndarray, "3"], radius: float) -> 
     normals = np.round(NORMAL_16 * scene.normals).astype(np.int16)
     corners = scene.faces.reshape(-1).astype(np.int64)
     moves = np.diff(corners, prepend=0)
+    soft = scene.soft
+    bounce_scale = float(soft.bounce.abs().max()) if len(soft.bounce) else 0.0
+    bounce_scale = bounce_scale or 1.0
     zigzag = np.where(moves < 0, -2 * moves - 1, 2 * moves).astype(np.uint32)
     arrays = {
         "places": (_planes(steps.T), len(steps)),
@@ -41,6 +44,11 @@ def packed(scene: StageScene, centre: Float[np.ndarray, "3"], radius: float) -> 
         "evidence": (scene.evidence, len(steps)),
         "gloss": (scene.gloss.T, len(steps)),
         "corners": (_planes(zigzag), len(corners)),
+        "sky": (_share(soft.sky.numpy()), len(steps)),
+        "below": (_share((soft.sky if soft.below is None else soft.below).numpy()), len(steps)),
+        "bounce": (np.round(127 * soft.bounce.numpy().T / bounce_scale).astype(np.int8), len(steps)),
+        "tint": (_share(soft.tint.numpy()).T, len(steps)),
+        "groundSky": (_share(scene.ground_sky), len(scene.ground_sky)),
     }
     parts, content, offset = {}, [], 0
     for name, (array, count) in arrays.items():
@@ -49,6 +57,7 @@ def packed(scene: StageScene, centre: Float[np.ndarray, "3"], radius: float) -> 
         content.append(data)
         offset += len(data)
     parts["places"] |= {"low": low.tolist(), "high": high.tolist()}
+    parts["bounce"] |= {"scale": bounce_scale}
     return Block(gzip.compress(b"".join(content), PACKING, mtime=0), parts)
 
 
@@ -76,6 +85,10 @@ def jpeg(picture: UInt8[np.ndarray, "height width 3"], quality: int, is_exact: b
 def as_address(content: bytes, kind: str) -> str:
     """Return a file as a data address."""
     return f"data:{kind};base64," + base64.b64encode(content).decode()
+
+
+def _share(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
+    return np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)
 
 
 def _planes(values: Shaped[np.ndarray, "..."]) -> UInt8[np.ndarray, "bytes ..."]:

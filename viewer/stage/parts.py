@@ -9,13 +9,14 @@ from jaxtyping import UInt8
 from calibration.camera import Camera
 from calibration.posed_camera import PosedCamera
 from capture.errors import CaptureError, UserError
-from reconstruct.export.stage_scene import StageScene, detail_pictures, relit_photo, stage_scene
-from reconstruct.render.studio import KEY_TURN, Studio, key_light, studio_of
+from reconstruct.export.first_view import FirstView
+from reconstruct.export.stage_scene import StageScene, detail_pictures, stage_scene
+from reconstruct.render.studio import Studio, studio_of
 from reconstruct.stored_run.maps import read_thumbnail
 from reconstruct.stored_run.stage_pack import stage_archive
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.stage.cameras import lit_photos
-from viewer.stage.facts import BACKGROUND, first_window, home_pose, home_view, stage_facts
+from viewer.stage.facts import BACKGROUND, first_window, home_pose, stage_facts
 from viewer.stage.pack import Block, jpeg, packed
 
 QUALITY, NORMAL_QUALITY, PHOTO_QUALITY = 90, 95, 82  # JPEG
@@ -65,7 +66,7 @@ class StageParts:
             BLOCK: self._block.content,
             OBJECT: jpeg(scene.object_picture, QUALITY),
             GROUND: jpeg(scene.ground_picture, QUALITY),
-            FIRST: jpeg(self._first(), FIRST_QUALITY),
+            FIRST: jpeg(self.first.picture(np.array(BACKGROUND, np.uint8)), FIRST_QUALITY),
         }
         if scene.normal_picture is not None:
             parts[NORMALS] = jpeg(scene.normal_picture, NORMAL_QUALITY, is_exact=True)
@@ -114,17 +115,17 @@ class StageParts:
             "photos": {photo: _photo_name(i) for i, photo in enumerate(self._photos)},
             "tiles": tiles,
         }
-        return stage_facts(self.run, self.studio, self.scene, self._block, named)
+        return stage_facts(self.run, self.studio, self.scene, self._block, self.first.lamp, named)
 
-    def _first(self) -> UInt8[np.ndarray, "h w 3"]:
-        """Return the picture that stands where the page's own first picture will, until that is drawn."""
+    @cached_property
+    def first(self) -> FirstView:
+        """What stands where the page's own first picture will, until that is drawn; and its lamp."""
         fields, studio = self.run.fields, self.studio
         left, top, right, _ = first_window(self.scene.vertices, fields, studio)
         focal = FIRST_SIDE / (right - left)
         camera = Camera(FIRST_SIDE, FIRST_SIDE, focal, focal, -left * focal - 0.5, -top * focal - 0.5)
         place = PosedCamera(camera, home_pose(fields, studio), fields.ground_height)
-        light = key_light(studio, home_view(fields, studio)["azimuth"] + KEY_TURN)
-        return relit_photo(fields, place, light, studio, self.scene.ground_mean, np.array(BACKGROUND, np.uint8))
+        return FirstView(fields, place, studio, self.scene)
 
     def _tile(self, kind: int, row: int, column: int) -> bytes:
         assert self._details is not None

@@ -29,7 +29,7 @@ export function coarser(mesh, cells) {
 // The numbers of these vertices alone, in one block.
 function taken(mesh, kept, vertices) {
   const made = {};
-  for (const [name, size] of [["place", 3], ["facing", 4], ["paint", 4], ["shine", 4]]) {
+  for (const [name, size] of [["place", 3], ["facing", 4], ["paint", 4], ["shine", 4], ["bounced", 4], ["soft", 4]]) {
     const from = mesh[name], to = made[name] = new from.constructor(size * vertices);
     for (let i = 0, at = 0; i < vertices; i++) for (let k = 0, start = size * kept[i]; k < size; k++) to[at++] = from[start + k];
   }

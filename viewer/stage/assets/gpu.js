@@ -2,6 +2,7 @@
 import { byId } from "./scene.js";
 
 export let gl = null;
+let plain = null;
 export let sharp = null;     // format of a target that averages samples
 
 export function openCanvas(canvas) {
@@ -53,6 +54,14 @@ export function pictureTexture(picture, isColour, smaller = true) {
   return texture;
 }
 
+// Shares of a square, one byte each.
+export function shareTexture(shares, side) {
+  const texture = flat(gl.LINEAR);
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.R8, side, side, 0, gl.RED, gl.UNSIGNED_BYTE, shares);
+  return texture;
+}
+
 export function depthTexture(width, height, compares) {
   const texture = flat(compares ? gl.LINEAR : gl.NEAREST);
   gl.texStorage2D(gl.TEXTURE_2D, 1, gl.DEPTH_COMPONENT24, width, height);
@@ -67,9 +76,9 @@ export function depthTexture(width, height, compares) {
 export function target(width, height, formats, depth) {
   const frame = gl.createFramebuffer(), textures = [];
   gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
-  formats.forEach(([internal, type, filter], i) => {
-    const texture = flat(filter || gl.NEAREST);
-    gl.texImage2D(gl.TEXTURE_2D, 0, internal, width, height, 0, gl.RGBA, type, null);
+  formats.forEach(([internal, type, kind], i) => {
+    const texture = flat(gl.NEAREST);
+    gl.texImage2D(gl.TEXTURE_2D, 0, internal, width, height, 0, kind || gl.RGBA, type, null);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + i, gl.TEXTURE_2D, texture, 0);
     textures.push(texture);
   });
@@ -87,6 +96,18 @@ export function drop(old) {
   if (!old) return;
   for (const texture of [...old.textures, old.depthMap]) if (texture) gl.deleteTexture(texture);
   gl.deleteFramebuffer(old.frame);
+}
+
+// Draws while a comparing depth texture in this unit gives its depth instead.
+export function plainDepth(unit, draw) {
+  if (!plain) {
+    plain = gl.createSampler();
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.samplerParameteri(plain, name, gl.NEAREST);
+    for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.samplerParameteri(plain, name, gl.CLAMP_TO_EDGE);
+  }
+  gl.bindSampler(unit, plain);
+  draw();
+  gl.bindSampler(unit, null);
 }
 
 export function bind(shader, textures) {

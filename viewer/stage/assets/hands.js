@@ -2,6 +2,7 @@
 import { byId } from "./scene.js";
 import { goHome, lampFromAbove, putLamp, redo, setShown, setView, shown, turnView, undo, view, zoomView, LOOKS } from "./state.js";
 import { endTool, moveCross, placeAt, tool } from "./notes.js";
+import { listKeys } from "./panel.js";
 
 const TURN_PER_PX = 0.007, TURN_PER_KEY = 0.1, LIGHT_PER_KEY = 0.06, ZOOM_PER_NOTCH = 1.12, CROSS_PER_KEY = 8, SHIFT_PER_KEY = 0.04;
 const REACH = 0.48;                   // of the window's shorter side: there the lamp is at the horizon
@@ -25,7 +26,7 @@ export function useHands(middle, whenMoved) {
   canvas.addEventListener("contextmenu", (e) => e.preventDefault());
   canvas.addEventListener("wheel", (e) => { e.preventDefault(); moved(e.timeStamp); zoomView(e.deltaY > 0 ? 1 / ZOOM_PER_NOTCH : ZOOM_PER_NOTCH, inSides(e.clientX, e.clientY)); }, { passive: false });
   canvas.addEventListener("dblclick", () => { if (!tool.kind) goHome(); });
-  canvas.addEventListener("keydown", key);
+  window.addEventListener("keydown", key);
   // Keys that the page around this one got, as long as one of its buttons has the focus.
   window.addEventListener("message", ({ source, data }) => {
     if (source === parent && parent !== window && data.press) canvas.dispatchEvent(new KeyboardEvent("keydown", { ...data.press, bubbles: true, cancelable: true }));
@@ -64,7 +65,14 @@ function move(e) {
   else lightFrom(...now);
 }
 
+// Keys that an element needs for itself, when it has the focus.
+function isItsOwn({ target, key }) {
+  if (target.closest("dialog, select, textarea, input[type=number], input[type=text]")) return true;
+  return target.matches("input[type=range]") ? /^(Arrow|Home|End|Page)/.test(key) : key === "Enter" && target.matches("button, summary, a, input");
+}
+
 function key(e) {
+  if (isItsOwn(e)) return;
   const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[e.key];
   if (step) {
     e.preventDefault();
@@ -77,6 +85,7 @@ function key(e) {
   else if (e.key === "Escape" && tool.kind) endTool();
   else if (e.key === "+" || e.key === "=") zoomView(ZOOM_PER_NOTCH);
   else if (e.key === "-") zoomView(1 / ZOOM_PER_NOTCH);
+  else if (e.key === "?") listKeys();
   else if (e.key === "Home" || e.key === "0") goHome();
   else if (e.key === "l" || e.key === "L") setShown({ follows: !shown.follows });
   else if (e.key >= "1" && e.key <= String(LOOKS.length)) setShown({ look: LOOKS[Number(e.key) - 1] });

@@ -4,7 +4,11 @@ precision highp float;
 precision highp sampler2DShadow;
 //#photo
 uniform sampler2D albedoMap, normalMap, glossMap, blurMap, depthMap;
+uniform highp usampler2D softMap;
 uniform sampler2DShadow shadowMap;
+uniform sampler2D shadowDepth;   // the same, without comparing
+uniform vec4 shadowView;         // near, far, focal length over half a side; radius of the lamp's part
+uniform float numbered;          // of this sample
 uniform mat4 shadowClip;
 uniform float lift;            // along the normal, before a place is looked up in the shadow map
 uniform vec3 eye, right, down, forward;
@@ -33,14 +37,50 @@ uniform sampler2D before;      // mean of the samples so far
 uniform float share;           // of this sample in the new mean
 out vec4 result;
 
+#ifdef MOVING
+const int SEARCHED = 6, TAPS = 8;
+#else
+const int SEARCHED = 4, TAPS = 4;
+#endif
+const float SKY_BOUNCE = 12.0 / 7.0;  // the overcast sky's radiance over all its directions, where level ground receives 1
 const float GRAZING = 0.05, DIELECTRIC = 0.04;
 
-float shadow(vec3 p) {
+const vec2 GOLDEN_TURN = vec2(-0.73736888, 0.67549029);  // cosine and sine of 2.4 rad
+
+vec2 turnedBy(vec2 v, vec2 by) { return vec2(v.x * by.x - v.y * by.y, v.x * by.y + v.y * by.x); }
+
+// Share of the lamp's part that a place sees: what hides it is looked for first, for the shadow's edge is as wide as
+// that is far away [Fernando 2005, Percentage-closer soft shadows]. Each pixel turns its taps by an angle of its own
+// [Jimenez 2014, interleaved gradient noise], so that few give grain, not steps, and the mean of the samples neither.
+float shadow(vec3 p, vec3 n, float facing) {
   vec4 there = shadowClip * vec4(p, 1.0);
-  vec3 at = there.xyz / there.w * 0.5 + 0.5;
-  if (there.w <= 0.0 || any(lessThan(at.xy, vec2(0.0))) || any(greaterThan(at.xy, vec2(1.0)))) return 1.0;
+  float z = there.w;
+  if (z <= 0.0) return 1.0;
+  vec3 at = there.xyz / z * 0.5 + 0.5;
+  if (any(lessThan(at.xy, vec2(0.0))) || any(greaterThan(at.xy, vec2(1.0)))) return 1.0;
   at.z = min(at.z, 1.0);  // behind the object lies the ground, farther than the map reaches
-  return texture(shadowMap, at);
+  float middle = texture(shadowMap, at);
+  if (shadowView.w <= 0.0) return middle;
+  float near = shadowView.x, far = shadowView.y, reach = 0.5 * shadowView.z * shadowView.w;
+  // Depth along the receiver's own plane, per step across the map: what lies behind the plane hides nothing.
+  vec2 slope = 2.0 * far * near / (far - near) * (shadowClip * vec4(n, 0.0)).xy / (shadowView.z * shadowView.z * facing);
+  float angle = 6.2831853 * fract(52.9829189 * fract(dot(gl_FragCoord.xy + 5.588238 * numbered, vec2(0.06711056, 0.00583715))));
+  vec2 way = vec2(cos(angle), sin(angle)), step_;
+  float widest = reach * (z - near) / (near * z), sum = 0.0, found = 0.0;
+  for (int i = 0; i <= SEARCHED; i++) {
+    step_ = widest * float(i) / float(SEARCHED) * way;
+    float d = texture(shadowDepth, at.xy + step_).r;
+    if (d < at.z + min(dot(slope, step_), 0.0)) { sum += 2.0 * far * near / (far + near - (2.0 * d - 1.0) * (far - near)); found += 1.0; }
+    way = turnedBy(way, GOLDEN_TURN);
+  }
+  if (found == 0.0) return 1.0;
+  float before = sum / found, wide = reach * max(z - before, 0.0) / (before * z), share = 0.0;
+  for (int i = 0; i < TAPS; i++) {
+    step_ = wide * sqrt((float(i) + 0.5) / float(TAPS)) * way;
+    share += texture(shadowMap, vec3(at.xy + step_, at.z + min(dot(slope, step_), 0.0)));
+    way = turnedBy(way, GOLDEN_TURN);
+  }
+  return share / float(TAPS);
 }
 
 #ifdef GLOSS
@@ -143,9 +183,12 @@ void main() {
 #endif
     vec3 way = lamp - p, towards = normalize(way), view = normalize(eye - p);
     float facing = max(dot(n, towards), 0.0);
-    float lit = facing > 0.0 ? shadow(isObject ? p + lift * geometric : p) : 0.0;
+    float lit = facing > 0.0 ? shadow(isObject ? p + lift * geometric : p, geometric, max(dot(geometric, way), GRAZING)) : 0.0;
     float sent = strength / dot(way, way);
-    vec3 light = vec3(ambient + sent * facing * lit);
+    uvec4 around = texelFetch(softMap, at, 0);
+    vec4 bounce = vec4(unpackSnorm2x16(around.x), unpackSnorm2x16(around.y)), tintSky = vec4(unpackUnorm2x16(around.z), unpackUnorm2x16(around.w));
+    float bounced = strength / dot(lamp, lamp) * max(0.0, dot(bounce, vec4(1.0, normalize(lamp)))) + ambient * max(0.0, SKY_BOUNCE * bounce.x + bounce.w);
+    vec3 light = vec3(ambient * tintSky.a + sent * facing * lit) + tintSky.rgb * bounced;
     colour = albedo * light;
     vec3 shine = vec3(0.0);
     float blur = 1.0;
@@ -177,7 +220,11 @@ void main() {
 #endif
 #if LOOK == 5
     if (isObject) {
-      vec3 said = mix(vec3(0.75, 0.16, 0.1), mix(vec3(0.9, 0.55, 0.08), vec3(0.12, 0.5, 0.25), smoothstep(0.5, 1.0, paint.a)), smoothstep(0.0, 0.5, paint.a));
+      // As the legend's signs in stage.css: light and plain, striped, dark and crossed.
+      vec2 across = fract((gl_FragCoord.xx + vec2(1.0, -1.0) * gl_FragCoord.y) / (size.y / 75.0));
+      vec3 shadowed = across.x < 0.5 ? vec3(0.791, 0.347, 0.0) : vec3(0.254, 0.102, 0.0);
+      vec3 guessed = min(across.x, across.y) < 0.17 ? vec3(0.371, 0.115, 0.305) : vec3(0.074, 0.009, 0.056);
+      vec3 said = mix(guessed, mix(shadowed, vec3(0.624, 0.791, 0.930), smoothstep(0.7, 0.8, paint.a)), smoothstep(0.2, 0.3, paint.a));
       colour = said * (0.25 + 0.9 * light);
     }
 #endif

@@ -4,24 +4,29 @@ import { openCanvas, sharp } from "./gpu.js";
 import { tilesBeyond } from "./tiles.js";
 import { openPasses, preparePasses } from "./passes.js";
 import { draw, pace_, samplesDone, startRenderer, tilesCame } from "./renderer.js";
-import { firstPlace, frameObject, home, lamp, onChange, setLamp, setShown, setView, shown, view } from "./state.js";
+import { firstPlace, frameObject, lamp, onChange, setLamp, setShown, setView, shown, view } from "./state.js";
 import { drawBar, drawNotes, linesInSpace } from "./overlay.js";
 import { notesSay } from "./notes.js";
 import { pickFrom } from "./pick.js";
 import { useHands } from "./hands.js";
-import { isNarrow, openPanel, showLamp, showSaved, showShown, showStage, usePanel } from "./panel.js";
+import { isNarrow, openPanel, panelMoved, showLamp, showSaved, showShown, showStage, usePanel } from "./panel.js";
 
 const SETTLED_MS = 250;
 const ROOMY = 1100;                  // px of a window in which the panel is open at first
+const EDGE = 20;                     // px
 const LAMP_SAID_MS = 200;
 let pointerAt = 0, settling = 0, lampWaits = 0;
 
-// The part of the window that nothing lies over.
+// The part of the window that nothing lies over: above and below by what stands there, on the right by an open panel.
 function freePart() {
-  const panel = byId("panel"), right = panel.hidden || isNarrow() ? 0 : panel.offsetWidth + 28, top = isNarrow() ? 130 : 20;
-  return { left: 0, top, width: innerWidth - right, height: innerHeight - top - 20 };
+  const panel = byId("panel"), isOpen = !panel.hidden, box = panel.getBoundingClientRect(), [header, modes] = ["header", "#modes"].map((name) => document.querySelector(name).getBoundingClientRect());
+  const legend = byId("legend").hidden ? innerHeight : byId("legend").getBoundingClientRect().top;
+  const top = isNarrow() ? header.bottom : EDGE, bottom = !isNarrow() ? innerHeight - EDGE : Math.min(isOpen ? box.top : modes.top || innerHeight, legend);
+  const width = isOpen && !isNarrow() ? box.left : innerWidth;
+  return bottom - top < innerHeight / 4 ? { left: 0, top: 0, width, height: innerHeight } : { left: 0, top, width, height: bottom - top };
 }
 
+const reframe = () => frameObject(innerWidth, innerHeight, freePart());
 const freeMiddle = () => { const free = freePart(); return [free.left + free.width / 2, free.top + free.height / 2]; };
 
 function changed(what) {
@@ -61,8 +66,7 @@ async function begin() {
   const canvas = byId("picture"), { addresses } = facts;
   usePanel(() => draw("still"));
   openPanel(innerWidth >= ROOMY);
-  frameObject(innerWidth, innerHeight, freePart());
-  Object.assign(view, home, { shift: [...home.shift] });
+  reframe();
   showFirst();
   await new Promise((done) => requestAnimationFrame(() => setTimeout(done)));  // it is on the screen before what follows
   openCanvas(canvas);
@@ -77,7 +81,8 @@ async function begin() {
   useHands(freeMiddle, (at) => { pointerAt = at; });
   onChange(changed);
   canvas.addEventListener("webglcontextlost", (e) => { e.preventDefault(); sayProblem("The graphics card gave up. Reload the page."); });
-  window.addEventListener("resize", () => { draw("view"); drawBar(); drawNotes(true); });
+  window.addEventListener("resize", reframe);
+  panelMoved(reframe);
   startRenderer(linesInSpace, () => byId("first").remove());
   drawBar();
   drawNotes(true);

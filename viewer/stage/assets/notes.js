@@ -1,7 +1,7 @@
 // Notes on the surface: arrows with a text and lengths with their uncertainty; saved views; copies of page and picture.
 import { add, norm } from "./vectors.js";
-import { byId, facts } from "./scene.js";
-import { editStage, lamp, setLamp, setShown, setView, shown, stage, view } from "./state.js";
+import { byId, facts, served } from "./scene.js";
+import { editStage, lamp, onScreen, setLamp, setShown, setView, shown, stage, view } from "./state.js";
 import { camerasThatShow, pick, pointingSigma } from "./pick.js";
 
 const original = document.documentElement.cloneNode(true);  // before anything was changed
@@ -12,7 +12,7 @@ export const notesSay = (speaker) => { say = speaker; };
 const digits = () => (facts.unit === "mm" ? 1 : 3);
 
 export function startTool(kind) {
-  Object.assign(tool, { kind, first: null, cross: [innerWidth / 2, innerHeight / 2] });
+  Object.assign(tool, { kind, first: null, cross: onScreen([0, 0, 0], innerWidth, innerHeight).slice(0, 2) });  // on the object's middle
   const touch = "Tap the surface, or move the cross with the arrow keys and press Enter. Escape ends it.";
   say(kind === "length" ? `First end. ${touch}` : touch);
   showCross();
@@ -101,9 +101,17 @@ function download(name, blob) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }
 
-// This page with the notes in it. A served page has its parts beside it, so there the server's export makes the copy.
-export function savePage() {
+// This page as one file with everything in it. A served page has its parts beside it, so there the server makes the file.
+export async function sharePage() {
+  if (served.saves === "socket") {
+    say("Making the page ...");
+    const answer = await fetch("share.html").catch(() => null);
+    say(answer?.ok ? "" : "The page could not be made: the server does not answer. Is it still running?");
+    if (answer?.ok) download(`${facts.name}.html`, await answer.blob());
+    return;
+  }
   const copy = original.cloneNode(true);
+  copy.querySelector("#served").textContent = JSON.stringify({ saves: "", home: "" });
   copy.querySelector("#document").textContent = JSON.stringify(stage).replaceAll("<", "\\u003c");
   download(`${facts.name}.html`, new Blob([`<!doctype html>\n${copy.outerHTML}`], { type: "text/html" }));
 }

@@ -3,33 +3,38 @@ import { byId, facts, served } from "./scene.js";
 import {
   canRedo, canUndo, editStage, lamp, lampFromAbove, lampTo, putLamp, redo, savedSentence, setLamp, setShown, setView, shown, stage, undo,
 } from "./state.js";
-import { recallView, removeNote, removeView, saveNotes, savePage, savePicture, saveView, startTool } from "./notes.js";
+import { recallView, removeNote, removeView, saveNotes, savePicture, saveView, sharePage, startTool } from "./notes.js";
 import { showPhoto } from "./renderer.js";
 
 const RAKING = 8 * Math.PI / 180;
 const NARROW = 700;
+let whenMoved = () => {};
 let fromCamera = 0;                  // number of the camera at whose place the view was put last
 const unit_ = facts.unit === "mm" ? "mm" : "units";
 const on = (id, event, act) => byId(id).addEventListener(event, act);
+const KEYS = [
+  ["Arrows", "move the lamp"], ["Shift and arrows", "turn the view"], ["Ctrl and arrows", "shift the picture"], ["+ and -", "zoom"],
+  ["Home or 0", "back to the first view and lamp"], ["L", "the light follows the mouse, or stays"], ["1 to 7", "what is shown: 6 is what is known"],
+  ["Ctrl Z, Ctrl Shift Z", "undo, redo"], ["Enter, Escape", "place a note at the cross, end it"], ["?", "this list"],
+];
 const ABOUT = [
-  "Move the mouse: the lamp follows it over the object. Drag to turn, roll the wheel to zoom, drag with the right button to shift; a double click goes back. One finger moves the lamp, two turn and zoom; the buttons above change what one finger does.",
+  "Move the mouse: the lamp follows it over the object. Drag to turn, roll the wheel to zoom, drag with the right button to shift; a double click goes back. One finger moves the lamp, two turn and zoom; the buttons below the picture change what one finger does.",
   "The picture is the photo's own pixels: their colours without light, lit anew on the reconstructed surface. It is the same surface, light and shadow from all sides. What the photos do not show takes the colour of the nearest place that they show.",
-  "\u201cWhat is known\u201d colours the surface: green was seen in the photos, amber is held by shadows alone, red is a guess. The ground outside the photo is its mean colour.",
-  "Light falls off with the square of the distance; light that bounces is one even glow. Raking light, specular enhancement and unsharp masking are those of reflectance transformation imaging. Curvature shows ridges light and grooves dark. Surroundings are a room that was made up.",
+  "\u201cWhat is known\u201d colours the surface: what was seen in the photos is light and plain, what shadows alone hold is striped, a guess is dark and crossed. The ground outside the photo is its mean colour.",
+  "Light falls off with the square of the distance. Some comes from an overcast sky, as much as object and ground leave of it, and some bounces once. Raking light, specular enhancement and unsharp masking are those of reflectance transformation imaging. Curvature shows ridges light and grooves dark. Surroundings are a room that was made up.",
   "Crop box, smoothing and cutting the guess away are written into meshes that are exported from now on; the run's own mesh stays as it was, so that all can be undone. Here smoothing changes the shading alone.",
   "A length's \u00b1 is the error of pointing at both ends, one standard deviation; the surface's own error comes on top and is stated in the report.",
 ];
 
 export function usePanel(redraw) {
-  const { materials, addresses, known } = facts;
+  const { materials, addresses } = facts;
   for (const name of Object.keys(materials.chosen)) byId("material").append(new Option(name[0].toUpperCase() + name.slice(1), name));
   for (const name of Object.keys(addresses.photos)) byId("photo").append(new Option(name, name));
   for (const place of document.querySelectorAll(".unit")) place.textContent = unit_;
   for (const text of ABOUT) byId("about").append(Object.assign(document.createElement("p"), { textContent: text }));
-  byId("known").textContent = Object.entries(known).map(([word, share]) => `${Math.round(100 * share)} % ${word}`).join(", ");
+  legend();
+  keyList();
   byId("softness").value = Math.sqrt(lamp.radius / facts.largestLamp);
-  byId("save-page").disabled = Boolean(served.saves);
-  if (served.saves) byId("save-page").title = "Export the page instead: it then holds all its parts.";
   if (served.home) {
     const link = Object.assign(document.createElement("a"), { href: served.home, textContent: "Inspect this run in 3D" });
     byId("home-link").append(link);
@@ -38,7 +43,8 @@ export function usePanel(redraw) {
   lookControls();
   documentControls();
   on("save-picture", "click", () => savePicture(redraw));
-  on("save-page", "click", savePage);
+  on("share", "click", sharePage);
+  on("list-keys", "click", listKeys);
   on("save-notes", "click", saveNotes);
   on("menu", "click", () => openPanel(byId("panel").hidden));
   cropRows();
@@ -50,7 +56,27 @@ export function openPanel(isOpen) {
   byId("panel").hidden = !isOpen;
   if (isOpen) showLamp();
   byId("menu").setAttribute("aria-expanded", String(isOpen));
+  whenMoved();
 }
+
+export const panelMoved = (act) => { whenMoved = act; };
+
+// What the colours of "What is known" mean, with their shares of the surface.
+function legend() {
+  const { known, kinds } = facts;
+  byId("legend").append(...Object.entries(kinds).map(([kind, words]) => {
+    const item = document.createElement("li"), sign = Object.assign(document.createElement("i"), { className: kind });
+    item.append(sign, words in known ? `${Math.round(100 * known[words])} % ${words}` : words);
+    return item;
+  }));
+}
+
+function keyList() {
+  const row = (tag, textContent) => Object.assign(document.createElement(tag), { textContent });
+  for (const [keys, words] of KEYS) byId("key-list").append(row("dt", keys), row("dd", words));
+}
+
+export const listKeys = () => byId("keys").showModal();
 
 export const isNarrow = () => innerWidth <= NARROW;
 
@@ -164,6 +190,8 @@ export function showLamp() {
 }
 
 export function showShown() {
+  const isLegend = shown.look === "known";
+  if (byId("legend").hidden === isLegend) { byId("legend").hidden = !isLegend; whenMoved(); }
   byId("follows").checked = shown.follows;
   byId("look").value = shown.look;
   byId("surroundings").checked = shown.surroundings;

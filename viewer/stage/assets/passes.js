@@ -2,9 +2,9 @@
 import { add, axesTowards, clipFrom, cross, dot, norm, unit } from "./vectors.js";
 import { cameraOf, facts, groundPlace, toPage } from "./scene.js";
 import { coarser } from "./coarse.js";
-import { bind, gl, pictureTexture, program, target } from "./gpu.js";
+import { bind, gl, pictureTexture, plainDepth, program, shareTexture, target } from "./gpu.js";
 import { tiles } from "./tiles.js";
-import { LOOKS, home, shown, stage, view } from "./state.js";
+import { LOOKS, home, isBelow, shown, stage, view } from "./state.js";
 
 const SHADOW_SIDE = 1024, SHADOW_MOVING = 512;  // px of the shadow map
 const OBJECT = 1.05;                 // radius of the sphere that holds the object, with a margin
@@ -46,6 +46,7 @@ export function preparePasses(mesh, pictures) {
   pass.shadowMoving = target(SHADOW_MOVING, SHADOW_MOVING, [], 2);
   pass.object = pictureTexture(pictures.object, true);
   pass.ground = pictureTexture(pictures.ground, true);
+  pass.groundSky = shareTexture(mesh.ground.sky, mesh.ground.side);
   pass.normals = pictures.normals ? pictureTexture(pictures.normals, false) : null;
 }
 
@@ -56,6 +57,8 @@ function vertexArray(mesh) {
   buffer(1, mesh.facing, 4, gl.SHORT, true);
   buffer(2, mesh.paint, 4, gl.UNSIGNED_BYTE, true);
   buffer(3, mesh.shine, 4, gl.UNSIGNED_BYTE, true);
+  buffer(4, mesh.bounced, 4, gl.BYTE, true);
+  buffer(5, mesh.soft, 4, gl.UNSIGNED_BYTE, true);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
   gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, mesh.index, gl.STATIC_DRAW);
   return { array, count: mesh.index.length };
@@ -114,7 +117,7 @@ export function drawDepth(into, place, isMoving = false) {
   drawObject(isMoving ? "shadow" : "whole");
   gl.disable(gl.POLYGON_OFFSET_FILL);
   gl.disable(gl.DEPTH_TEST);
-  return { clip, lift: liftOf(f, away, into.width) + (isMoving ? 0.5 / CELLS.shadow : 0) };
+  return { clip, f, near, far, lift: liftOf(f, away, into.width) + (isMoving ? 0.5 / CELLS.shadow : 0) };
 }
 
 // A shadow is looked up this far along the normal: a voxel, as Shadowgraph's own renderer does, or a texel of the map.
@@ -123,7 +126,7 @@ const liftOf = (f, away, side) => Math.max(facts.spacing / facts.radius, 2.0 * a
 // View to clip, with near and far; sizes in px.
 export function viewClip(camera, width, height, jitter) {
   const away = norm(camera.eye), side = Math.min(width, height), focal = view.focal * side;
-  const near = Math.max(away - 1.3 * OBJECT, 0.04 * away), far = away + 1.5 * OPEN_GROUND;
+  const near = 0.04 * away, far = away + 1.5 * OPEN_GROUND;
   const shift = [view.shift[0] * side + jitter[0], view.shift[1] * side + jitter[1]];
   const clip = clipFrom(camera, 2 * focal / width, 2 * focal / height, 2 * shift[0] / width, 2 * shift[1] / height, near, far);
   return { clip, near, far, focal, shift };
@@ -159,12 +162,14 @@ export function drawSurface(into, seen, isMoving = false) {
   gl.bindFramebuffer(gl.FRAMEBUFFER, into.frame);
   gl.viewport(0, 0, into.width, into.height);
   gl.enable(gl.DEPTH_TEST);
-  gl.clearColor(0, 0, 0, 0);
-  gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+  gl.clearBufferfv(gl.COLOR, 1, [0, 0, 0, 0]);  // nothing is anywhere; what is nowhere needs no colour
+  gl.clearBufferfv(gl.DEPTH, 0, [1]);
   const object = surfaceShader("", isHome), { at } = object;
   gl.useProgram(object.made);
   gl.uniformMatrix4fv(at("clip"), false, seen.clip);
   setPhoto(object);
+  gl.uniform1i(at("isBelow"), isBelow() ? 1 : 0);
+  gl.uniform1f(at("bounceScale"), facts.parts.bounce.scale);
   gl.uniform4f(at("objectWindow"), ...facts.objectWindow);
   const pictures = [["objectPicture", pass.object]];
   if (pass.normals) pictures.push(["normalPicture", pass.normals]);
@@ -188,7 +193,8 @@ function drawGround(seen, isHome) {
   gl.uniformMatrix4fv(ground.at("clip"), false, seen.clip);
   setPhoto(ground);
   gl.uniform3f(ground.at("groundMean"), ...facts.groundMean);
-  bind(ground, [["groundPicture", pass.ground]]);
+  gl.uniform1f(ground.at("groundHalf"), facts.groundHalf);
+  bind(ground, [["groundPicture", pass.ground], ["groundSky", pass.groundSky]]);
   gl.bindVertexArray(groundVao);
   gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
 }
@@ -241,6 +247,8 @@ export function drawLight(into, surface, blurred, seen, light, sample = 0, befor
   gl.uniform2f(at("nearFar"), seen.near, seen.far);
   gl.uniformMatrix4fv(at("shadowClip"), false, light.shadow.clip);
   gl.uniform1f(at("lift"), light.shadow.lift);
+  gl.uniform4f(at("shadowView"), light.shadow.near, light.shadow.far, light.shadow.f, light.reach);
+  gl.uniform1f(at("numbered"), sample);
   gl.uniform3f(at("lamp"), ...light.place);
   gl.uniform1f(at("strength"), light.strength);
   gl.uniform1f(at("ambient"), light.ambient);
@@ -251,8 +259,9 @@ export function drawLight(into, surface, blurred, seen, light, sample = 0, befor
   gl.uniform1f(at("worldPx"), seen.away / seen.focal);
   gl.uniform1i(at("markGuess"), stage.guess === "marked" ? 1 : 0);
   gl.uniform1f(at("turn"), home.azimuth);
-  const maps = [["albedoMap", surface.textures[0]], ["normalMap", surface.textures[1]], ["depthMap", surface.depthMap], ["shadowMap", light.map.depthMap]];
-  if (surface.textures[2]) maps.push(["glossMap", surface.textures[2]]);
+  const maps = [["albedoMap", surface.textures[0]], ["normalMap", surface.textures[1]], ["softMap", surface.textures[2]],
+    ["depthMap", surface.depthMap], ["shadowMap", light.map.depthMap], ["shadowDepth", light.map.depthMap]];
+  if (surface.textures[3]) maps.push(["glossMap", surface.textures[3]]);
   if (blurred) maps.push(["blurMap", blurred.textures[0]]);
   if (isWiped) {
     setPhoto(shader, cameraOf(shown.photo));
@@ -264,7 +273,7 @@ export function drawLight(into, surface, blurred, seen, light, sample = 0, befor
     maps.push(["before", before]);
   }
   bind(shader, maps);
-  gl.drawArrays(gl.TRIANGLES, 0, 3);
+  plainDepth(maps.findIndex(([name]) => name === "shadowDepth"), () => gl.drawArrays(gl.TRIANGLES, 0, 3));
 }
 
 export function drawShow(texture, sx, sy, full) {
@@ -309,4 +318,5 @@ export function lampPoint(place, radius, reach, angle) {
 }
 
 export const pictureDistance = (p, camera) => dot(add(p, camera.eye, -1), camera.forward);
-export const gBufferFormats = () => [[gl.RGBA8, gl.UNSIGNED_BYTE], [gl.RGBA16F, gl.HALF_FLOAT], ...(facts.gloss ? [[gl.RGBA8, gl.UNSIGNED_BYTE]] : [])];
+export const gBufferFormats = () => [[gl.RGBA8, gl.UNSIGNED_BYTE], [gl.RGBA16F, gl.HALF_FLOAT],
+  [gl.RGBA32UI, gl.UNSIGNED_INT, gl.RGBA_INTEGER], ...(facts.gloss ? [[gl.RGBA8, gl.UNSIGNED_BYTE]] : [])];

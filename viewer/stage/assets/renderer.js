@@ -1,5 +1,5 @@
 // When what is drawn, and how finely: coarse while something moves, averaged over samples at rest.
-import { add, clamp, halton, norm } from "./vectors.js";
+import { GOLDEN, add, clamp, halton, norm } from "./vectors.js";
 import { byId, facts, loadPicture, toPage } from "./scene.js";
 import { drop, gl, pictureTexture, sharp, target } from "./gpu.js";
 import { tiles, wantTiles } from "./tiles.js";
@@ -10,7 +10,7 @@ const MOVING_MS = 18;               // for one picture while something moves
 const REST_MS = 350, REST_COARSEST = 2;  // for one sample at rest: beyond, the picture has fewer pixels
 const COARSEST = 5, COARSE_AT_FIRST = 3;  // px of the screen per px of the picture
 const QUIET_MS = 250;               // after the last movement comes rest
-const GOLDEN = 0.61803398875;       // of a turn, between samples of the lamp
+const LEAST_PART = 0.25;            // of the lamp's radius: 32 of these cover its disc twice, so that none is seen alone
 const BLUR = 0.035;                 // radii of the object: unsharp masking and curvature look at forms of this size
 const canvas = byId("picture");
 const sized = { moving: {}, rest: {} };
@@ -78,10 +78,11 @@ function drawView(kind, have, jitter) {
 function drawShadow(isMoving, sample) {
   const key = `${isMoving} ${lamp.radius > 0 ? sample : 0}`;
   if (shadowOf === key) return;
-  const middle = lampPlace(), reach = isMoving ? 0 : Math.sqrt(halton(sample + 1, 2)), angle = 2 * Math.PI * (sample * GOLDEN % 1);
-  const place = lampPoint(middle, lamp.radius / facts.radius, reach, angle), map = isMoving ? pass.shadowMoving : pass.shadow;
+  // A sample is a part of the lamp's disc, each smaller than the last; places and part together spread as the disc does.
+  const radius = lamp.radius / facts.radius, part = Math.max(LEAST_PART, 1 / Math.sqrt(sample + 1)), angle = 2 * Math.PI * (sample * GOLDEN % 1);
+  const place = lampPoint(lampPlace(), radius, Math.sqrt((1 - part * part) * halton(sample, 2)), angle), map = isMoving ? pass.shadowMoving : pass.shadow;
   const strength = lamp.strength * (lamp.distance / facts.radius) ** 2;
-  light = { shadow: drawDepth(map, place, isMoving), map, place, strength, ambient: facts.ambient * lamp.strength / facts.lamp.strength };
+  light = { shadow: drawDepth(map, place, isMoving), map, place, reach: part * radius, strength, ambient: facts.ambient * lamp.strength / facts.lamp.strength };
   shadowOf = key;
 }
 

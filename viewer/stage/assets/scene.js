@@ -44,9 +44,10 @@ async function unpacked(address) {
 }
 
 export async function loadMesh() {
-  const raw = await unpacked(facts.addresses.block), { places, normals, colours, evidence, gloss, corners } = facts.parts;
+  const raw = await unpacked(facts.addresses.block), { places, normals, colours, evidence, gloss, corners, sky, below, bounce, tint, groundSky } = facts.parts;
   const n = places.count, m = corners.count;
   const place = new Float32Array(3 * n), facing = new Int16Array(4 * n), paint = new Uint8Array(4 * n), shine = new Uint8Array(4 * n);
+  const bounced = new Int8Array(4 * n), soft = new Uint8Array(4 * n);
   for (let axis = 0; axis < 3; axis++) {
     const high = places.offset + axis * n, low = high + 3 * n, from = places.low[axis], step = (places.high[axis] - from) / 65535;
     const nHigh = normals.offset + axis * n, nLow = nHigh + 3 * n, tint = colours.offset + axis * n;
@@ -56,7 +57,13 @@ export async function loadMesh() {
       paint[4 * i + axis] = ROOTS[raw[tint + i]];
     }
   }
-  for (let i = 0; i < n; i++) paint[4 * i + 3] = Math.min(255, 128 * raw[evidence.offset + i]);
+  for (let i = 0; i < n; i++) {
+    paint[4 * i + 3] = Math.min(255, 128 * raw[evidence.offset + i]);
+    for (let k = 0; k < 4; k++) bounced[4 * i + k] = raw[bounce.offset + k * n + i];
+    for (let k = 0; k < 3; k++) soft[4 * i + k] = raw[tint.offset + k * n + i];
+    soft[4 * i + 3] = raw[sky.offset + i];
+    facing[4 * i + 3] = 128.5 * raw[below.offset + i];
+  }
   const kinds = facts.gloss ? facts.gloss.lobes.length : 0;
   for (let k = 0; k < kinds; k++) for (let i = 0; i < n; i++) shine[4 * i + k] = raw[gloss.offset + k * n + i];
   const index = new Uint32Array(m);
@@ -65,7 +72,8 @@ export async function loadMesh() {
     last += z & 1 ? -((z + 1) / 2) : z / 2;
     index[i] = last;
   }
-  return { place, facing, paint, shine, index, count: n };
+  const side = groundSky.count, ground = { side, sky: raw.slice(groundSky.offset, groundSky.offset + side * side) };
+  return { place, facing, paint, shine, bounced, soft, index, count: n, ground };
 }
 
 // A picture as the graphics card takes it: decoded beside the page's own thread, its numbers as they are in the file.

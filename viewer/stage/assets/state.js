@@ -6,11 +6,12 @@ export const LOOKS = ["photo", "specular", "unsharp", "curvature", "normals", "k
 export const LOW = 0.03, HIGH = 0.998;        // radius of the lamp's place in the dome seen from above
 // Elevation of the view, rad. Of an object that was laid anew the underside was photographed, too: it is seen from below.
 export const HIGHEST = 1.5, LOWEST = facts.isWhole ? -HIGHEST : 0.06;
-const FILLED = 0.8;                           // of the window's sides, by the object at first
+const FILLED = 0.88;                          // of the free part's sides, by the object
 const MOST_UNDONE = 200;
 
 export const home = { ...facts.cameras[0].home, focal: 2.2, shift: [0, 0] };
 export let view = { ...home, shift: [0, 0] };
+let room = null, isFramed = true;             // the window and its free part, px; whether the view keeps the object in it
 export const lamp = { ...facts.lamp };
 export const shown = {
   look: "photo", gain: 1, sharpness: 40, layers: { lights: false, camera: false, grid: false, notes: true, bar: true },
@@ -24,9 +25,10 @@ export const onChange = (listener) => listeners.push(listener);
 export const tell = (what) => { for (const listener of listeners) listener(what); };
 
 // The eye and the axes of the view, in page lengths.
-export function cameraNow() {
-  const eye = onSphere(view.azimuth, view.elevation).map((x) => x * view.distance / facts.radius);
-  return axesTowards(eye, [0, 0, 0]);
+export const cameraNow = () => cameraOfView(view);
+
+function cameraOfView({ azimuth, elevation, distance }) {
+  return axesTowards(onSphere(azimuth, elevation).map((x) => x * distance / facts.radius), [0, 0, 0]);
 }
 
 export const lampPlace = () => onSphere(lamp.azimuth, lamp.elevation).map((x) => x * lamp.distance / facts.radius);
@@ -37,14 +39,30 @@ export function onScreen(p, width, height, camera = cameraNow()) {
   return [width / 2 + view.shift[0] * side + f * dot(q, camera.right) / z, height / 2 + view.shift[1] * side + f * dot(q, camera.down) / z, z];
 }
 
-// Chooses focal length and shift so that the object fills the free part of the window.
+// Focal length and shift with which the object fills the free part of the window, seen by a camera.
+function fitted(camera) {
+  const { width, height, free } = room, side = Math.min(width, height);
+  const seen = facts.outline.map((p) => { const q = add(p, camera.eye, -1), z = dot(q, camera.forward); return [dot(q, camera.right) / z, dot(q, camera.down) / z]; });
+  const ends = [0, 1].map((k) => [Math.min(...seen.map((q) => q[k])), Math.max(...seen.map((q) => q[k]))]);
+  const focal = FILLED * Math.min(free.width / (ends[0][1] - ends[0][0]), free.height / (ends[1][1] - ends[1][0])) / side;
+  return { focal, at: (f) => ({ focal: f, shift: [
+    (free.left + free.width / 2 - width / 2) / side - f * (ends[0][0] + ends[0][1]) / 2,
+    (free.top + free.height / 2 - height / 2) / side - f * (ends[1][0] + ends[1][1]) / 2,
+  ] }) };
+}
+
+// Says which part of the window is free; the view follows, unless a hand has zoomed or shifted it.
 export function frameObject(width, height, free) {
-  const { box } = facts, side = Math.min(width, height);
-  home.focal = FILLED * Math.min(free.width / (box[2] - box[0]), free.height / (box[3] - box[1])) / side;
-  home.shift = [
-    (free.left + free.width / 2 - width / 2) / side - home.focal * (box[0] + box[2]) / 2,
-    (free.top + free.height / 2 - height / 2) / side - home.focal * (box[1] + box[3]) / 2,
-  ];
+  room = { width, height, free };
+  const best = fitted(cameraOfView(home));
+  Object.assign(home, best.at(best.focal));
+  if (isFramed) setView({});
+}
+
+// As large as at first, or smaller where the object would reach beyond the free part.
+function framed() {
+  const best = fitted(cameraNow());
+  return best.at(Math.min(best.focal, home.focal));
 }
 
 // Where the picture that came with the page lies in the window, px: left, top, width.
@@ -54,8 +72,10 @@ export function firstPlace(width, height) {
 }
 
 export function setView(change) {
+  if ("focal" in change || "shift" in change) isFramed = false;
   Object.assign(view, change);
   view.elevation = clamp(view.elevation, LOWEST, HIGHEST);
+  if (isFramed) Object.assign(view, framed());
   view.focal = clamp(view.focal, home.focal * 0.25, home.focal * 60);
   tell("view");
 }
@@ -63,7 +83,8 @@ export function setView(change) {
 export function setLamp(change) { Object.assign(lamp, change); tell("lamp"); }
 
 export function goHome() {
-  setView({ ...home, shift: [...home.shift] });
+  isFramed = true;
+  setView({ azimuth: home.azimuth, elevation: home.elevation, distance: home.distance });
   setLamp({ ...facts.lamp, radius: lamp.radius, strength: lamp.strength });
 }
 
@@ -126,7 +147,7 @@ export let savedSentence = "";
 
 function saveStage() {
   unsaved = true;
-  savedSentence = served.saves ? "Saving ..." : "Kept in this window only. Save a copy of the page to keep it.";
+  savedSentence = served.saves ? "Saving ..." : "Kept in this window only. Share the page to keep it.";
   tell("saved");
   if (!served.saves) return;
   clearTimeout(waiting);

@@ -14,18 +14,30 @@ uniform mat4 seenClip;
 uniform float lift;                  // along the normal, before a place is looked up in seenMap
 uniform vec3 cropLow, cropHigh;
 uniform bool cutGuess;
+uniform sampler2D groundSky;
+uniform float groundHalf;            // of the square that groundSky tells of
+in vec4 bounced;
+in vec4 soft;
 in vec3 at;
 in vec3 facing;
 in vec4 paint;
 in vec4 shine;
 layout(location = 0) out vec4 albedo;    // the square root of it; alpha: what is known
 layout(location = 1) out vec4 normal;    // alpha: 1 the ground, 2 the object, 3 its inside
+layout(location = 2) out uvec4 around;   // soft light: what bounces, its tint, the sky's share
 #ifdef GLOSS
-layout(location = 2) out vec4 gloss;
+layout(location = 3) out vec4 gloss;
 #endif
 
 const float EDGE = 0.06;             // of the photo, over which its ground goes over into the mean colour
 const float GUESS = 0.25;            // what is known below this is a guess
+
+void keep(vec4 bounce, vec4 tintSky) {
+  around = uvec4(packSnorm2x16(bounce.xy), packSnorm2x16(bounce.zw), packUnorm2x16(tintSky.xy), packUnorm2x16(tintSky.zw));
+}
+
+// Irradiance under the overcast sky of a surface whose normal has this height, over that of level ground.
+float overcast(float up) { return 0.396 + up * (0.5 + 0.104 * up); }
 
 void main() {
   vec3 spot = inPhoto(at);
@@ -38,6 +50,7 @@ void main() {
   vec3 colour = mix(groundMean, texture(groundPicture, spot.xy).rgb, share);
   albedo = vec4(sqrt(colour), share);
   normal = vec4(0.0, 0.0, 1.0, 1.0);
+  keep(vec4(0.0), vec4(1.0, 1.0, 1.0, texture(groundSky, 0.5 + 0.5 * at.xy / groundHalf).r));
 #else
   vec3 n = normalize(facing);
 #ifdef CUT
@@ -45,6 +58,7 @@ void main() {
   if (!gl_FrontFacing) {
     albedo = vec4(vec3(0.35), 0.0);
     normal = vec4(-n, 3.0);
+    keep(vec4(0.0), vec4(1.0, 1.0, 1.0, 0.5));
     return;
   }
 #endif
@@ -69,6 +83,11 @@ void main() {
     colour = mix(colour, shown, share);
     n = normalize(mix(n, fine, share));
   }
+  float sky = soft.a;
+#if defined(NORMALS) || defined(FINE)
+  sky *= clamp(overcast(n.z) / max(overcast(normalize(facing).z), 0.05), 0.5, 2.0);  // what is finer than the mesh
+#endif
+  keep(bounced, vec4(soft.rgb, min(sky, 1.0)));
   albedo = vec4(sqrt(colour), paint.a);
   normal = vec4(n, 2.0);
 #ifdef GLOSS

@@ -8,6 +8,7 @@ export const norm = (a) => Math.hypot(...a);
 export const unit = (a) => { const n = norm(a); return a.map((x) => x / n); };
 export const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 export const onSphere = (azimuth, elevation) => [Math.cos(elevation) * Math.cos(azimuth), Math.cos(elevation) * Math.sin(azimuth), Math.sin(elevation)];
+export const GOLDEN = 0.61803398875;  // of a turn, between samples that come one after the other
 export const halton = (i, b) => { let f = 1, r = 0; for (; i > 0; i = Math.floor(i / b)) { f /= b; r += f * (i % b); } return r; };
 
 // Axes of somebody who stands at `eye`, looks at `target` and holds the head upright.
