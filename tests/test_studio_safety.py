@@ -344,3 +344,16 @@ def test_too_many_phones_are_refused(let_in, monkeypatch):
     joined(port, token)
     answer = Client(port).raw("POST", "/join", f'{{"token": "{door.door.token}", "name": "x"}}'.encode())
     assert answer.status == 400 and b"phones are in already" in answer.content
+
+
+@pytest.mark.parametrize("key", ["vase", "runs/vase", "captures/x"])
+def test_whatever_the_first_page_shows_can_be_deleted_and_comes_back(tmp_path, key):
+    capture_in(tmp_path, "vase")
+    capture_in(tmp_path / "captures", "x")
+    run_in(tmp_path, "vase")
+    with served(tmp_path) as (studio, _, owner):
+        path = studio.folder.root / key
+        owner.ok("delete", key=key)
+        assert not path.exists()
+        owner.ok("restore", id=owner.get("/api/state")[1]["trash"][0]["id"])
+        assert path.is_dir()
