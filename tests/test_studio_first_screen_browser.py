@@ -137,9 +137,14 @@ def test_keys_reach_the_result_while_a_button_has_the_focus(browser, folder, but
 
 @pytest.mark.parametrize("size", SIZES)
 @marked
-def test_the_picture_alone_fills_the_window(browser, folder, size):  # noqa: F811
+def test_a_question_mark_lists_the_keys_and_the_picture_alone_fills_the_window(browser, folder, size):  # noqa: F811
     with served(folder) as (_, _, owner):
-        tab, bad, _ = result_of(browser, owner, SIZES[size])
+        tab, bad, stage = result_of(browser, owner, SIZES[size])
+        tab.focus("button:has-text('Rename')")
+        tab.keyboard.press("?")
+        wait_until(tab, lambda: stage.evaluate("document.querySelector('dialog[open]') !== null"))
+        tab.keyboard.press("Escape")
+        wait_until(tab, lambda: stage.evaluate("document.querySelector('dialog[open]') === null"))
         tab.click("button:has-text('Fill the window')")
         wait_until(tab, lambda: tab.evaluate("document.fullscreenElement !== null"))
         assert tab.evaluate("document.fullscreenElement.className") == "result" and not bad
