@@ -11,7 +11,6 @@ from calibration.board.board import parse_board
 from calibration.board.board_photos import fit_board
 from calibration.calibrate import calibrate, left_out, refuse_other_size
 from calibration.calibration import Calibration
-from calibration.flashlight.light_estimate import RANGES
 from calibration.known_scene import KnownScene
 from calibration.light import Light
 from calibration.lights.files import GivenLights, read_lights, read_opinions
@@ -26,6 +25,8 @@ from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack, reduced
 from capture.session.session import Session
+
+IN_OBJECT = 0.2  # of the camera's distance from what it looks at: a lamp nearer to that stands in the object
 
 
 def calibrate_with_file(
@@ -141,10 +142,10 @@ def _refuse_near(lights: Sequence[Light], posed_camera: PosedCamera, path: Path)
     places = [light.position for light in lights if light.position is not None]
     reach = float(np.linalg.norm(posed_camera.looked_at() - posed_camera.centre))
     away = float(np.median(np.linalg.norm(np.array(places) - posed_camera.looked_at(), axis=1))) if places else np.inf
-    if away < RANGES[0] * reach:
+    if away < IN_OBJECT * reach:
         raise CalibrationError(
             f"{path} puts the lights {away:.3g} mm (median) from the ground point that the camera looks at, at least "
-            f"{RANGES[0] * reach:.0f} mm were needed ({RANGES[0]:g} of the camera's distance). Give their positions in "
+            f"{IN_OBJECT * reach:.0f} mm were needed ({IN_OBJECT:g} of the camera's distance). Give their positions in "
             "millimetres, in the frame of the board."
         )
 

@@ -68,16 +68,23 @@ class Recipe:
     ambient: float = AMBIENT
     width: int = 320  # px, of 4:3 photos
     board: bool = False  # a printed board lies beside the object
+    near: float = 1.0  # the camera's distance, the object's size and the texture's, of the usual ones
     lights: tuple[Light, ...] = field(default=())
 
+    def posed_camera(self) -> PosedCamera:
+        """Return the camera of the photos."""
+        return PosedCamera(
+            CAMERA, replace(WORLD_FROM_CAMERA, translation=self.near * WORLD_FROM_CAMERA.translation), 0.0
+        )
 
-def handheld_lights(n: int, rng: np.random.Generator) -> tuple[Light, ...]:
+
+def handheld_lights(n: int, rng: np.random.Generator, reach: tuple[float, float] = (380, 750)) -> tuple[Light, ...]:
     """Lights around the object, each aimed at it within some centimetres."""
     lights = []
     for k in range(n):
         azimuth, elevation = 2 * np.pi * (k + 0.3 * rng.random()) / n, np.radians(rng.uniform(22, 68))
         direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-        position = AIM + rng.uniform(380, 750) * np.array(direction)
+        position = AIM + rng.uniform(*reach) * np.array(direction)
         axis = AIM + rng.normal(size=3) * 30 - position
         power = POWER * np.array([1.0, 1.0, 1.0])
         lights.append(
@@ -93,9 +100,9 @@ def photograph(recipe: Recipe, seed: int = 0) -> Truth:
     height = recipe.width * 3 // 4
     camera = CAMERA.resized(recipe.width, height)
     rays = WORLD_FROM_CAMERA.rotate(camera.unproject(camera.pixel_grid()))
-    eye = WORLD_FROM_CAMERA.translation
+    eye = recipe.near * WORLD_FROM_CAMERA.translation
     points = eye - (eye[2] / np.minimum(rays[..., 2:], -1e-3)) * rays
-    x, y = points[..., 0], points[..., 1]
+    x, y = points[..., 0] / recipe.near, points[..., 1] / recipe.near
     albedo = 0.5 + 0.1 * np.sin(x / 23) * np.cos(y / 31) + 0.05 * np.sin((x + y) / 90)
     albedo = albedo[..., None] * [1.0, 0.9, 0.75]
     if recipe.board:
@@ -147,7 +154,7 @@ def _photo(
         cosine = half[..., 2] / np.linalg.norm(half, axis=-1)
         flash = flash * (1 + recipe.gloss * cosine[..., None] ** 60)
     if recipe.shadows:
-        offset = points[..., :2] - AIM[:2]
+        offset = points[..., :2] / recipe.near - AIM[:2]
         along, across = offset @ away, np.abs(offset @ np.array([-away[1], away[0]]))
         shadow = (across < 45) & (along > 0) & (along < 160)
         flash = np.where(shadow[..., None], 0.02 * flash, flash)

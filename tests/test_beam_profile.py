@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calibration.flashlight import common_motion, model
+from calibration.flashlight import joint_search, model
 from calibration.flashlight.beam_profile import (
     RING_STEP,
     RING_TERMS,
@@ -40,13 +40,13 @@ def _table(n_photos: int = 12):
     light = _led(off) * places[:, 2:] * SCALE**2 / distance**3
     grey = 0.1 * draw.uniform(0.3, 0.8, len(points)) * light * np.exp(draw.normal(0, 0.01, light.shape))
     rgb = np.repeat(grey[..., None], 3, -1)
-    cells = GroundCells(points, rgb, np.ones(grey.shape, bool), np.zeros(3), np.array([0.0, -500.0, 400.0]), SCALE)
+    cells = GroundCells(points, rgb, np.ones(grey.shape, bool), np.zeros(3), np.array([0.0, -500.0, 400.0]))
     return places, axes, Evidence.of(cells, np.ones(n_photos), 0.0)
 
 
 def test_aims_and_powers_of_beams_with_rings_are_found():
     places, axes, evidence = _table()
-    found, _ = common_motion._held(places, evidence, None)
+    found, _ = joint_search._held(places, evidence, None)
     off = np.degrees(np.arccos(np.clip((found.axes() * axes).sum(1), -1, 1)))
     assert np.median(off) < 1.0
     assert off.max() < 3.0
@@ -72,7 +72,7 @@ def test_what_is_expected_of_powers_beam_and_ambient_light_costs_one_at_one_sigm
     for column in [*range(6, 7 * n, 7), *range(7 * n, full)]:
         step = np.zeros(full)
         step[column] = 1e-6
-        ends = (model._prior_terms(state.moved(sign * step, 0.0, SCALE), evidence, priors)[0] for sign in (1, -1))
+        ends = (model._prior_terms(state.moved(sign * step, 0.0), evidence, priors)[0] for sign in (1, -1))
         np.testing.assert_allclose((next(ends) - next(ends)) / 2e-6, slope[:, column], rtol=1e-4, atol=1e-6)
 
 

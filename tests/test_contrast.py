@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from calibration.flashlight import common_motion
+from calibration.flashlight import joint_search
 from calibration.flashlight.fit import FlashlightFit
 from calibration.flashlight.model import Evidence, Flashlights, free_tangent
 from calibration.flashlight.outline_lights import outline_sigma
@@ -39,7 +39,7 @@ def _lights() -> np.ndarray:
 def _evidence(cells: int) -> Evidence:
     points = np.column_stack([np.linspace(-200, 200, cells), np.linspace(150, 250, cells), np.zeros(cells)])
     grey, known = np.full((COUNT, cells, 3), 0.2), np.ones((COUNT, cells), bool)
-    found = Evidence.of(GroundCells(points, grey, known, np.zeros(3), EYE, 566.0), np.ones(COUNT), 0.0)
+    found = Evidence.of(GroundCells(points, grey, known, np.zeros(3), EYE), np.ones(COUNT), 0.0)
     every = np.ones(COUNT, bool)
     return replace(found, outlines=Silent(None, EYE, 0.0, every, every))  # pyright: ignore[reportArgumentType]
 
@@ -49,24 +49,20 @@ def stand_ins(monkeypatch):
     """Joint fits whose misfit the contrast tells and whose lights it moves; returns the contrasts that are chosen."""
     chosen, level = [], np.log(0.2)
 
-    def joint(places, evidence, misfit, priors, like):
-        contrast = round(level / float(evidence.log_grey[0, 0]), 2)
+    def settled(like, evidence, misfit):
+        contrast = level / float(evidence.log_grey[0, 0])
+        chosen.append(contrast)
         state = replace(like, positions=_lights() * (1 + SHIFT * (contrast - 0.9)))
-        fit = FlashlightFit(state, evidence, evidence.weight, priors, free_tangent)
-        return 0.0, fit, MISFITS[contrast] / contrast
+        fit = FlashlightFit(state, evidence, evidence.weight, joint_search.LOOSE, free_tangent)
+        return 0.0, fit, np.interp(contrast, list(MISFITS), list(MISFITS.values())) / contrast
 
-    def motion(places, evidence, sizes, like):
-        chosen.append(level / float(evidence.log_grey[0, 0]))
-        return FlashlightFit(like, evidence, evidence.weight, common_motion.LOOSE, free_tangent)
-
-    monkeypatch.setattr(common_motion, "_joint", joint)
-    monkeypatch.setattr(common_motion, "best_common_motion", motion)
+    monkeypatch.setattr(joint_search, "_settled", settled)
     return chosen
 
 
 def _fitted(cells: int) -> FlashlightFit:
     start = Flashlights(_lights(), 0 * _lights(), np.zeros(COUNT), np.zeros(4), 0.0, np.zeros(3))
-    return common_motion.at_best_contrast(start, _evidence(cells))
+    return joint_search.at_best_contrast(start, _evidence(cells))
 
 
 @pytest.mark.parametrize(
@@ -78,15 +74,15 @@ def test_the_contrast_of_least_misfit_is_taken_and_the_usual_one_where_photos_sa
 ):
     """Between contrasts that are about as likely lights lie 3 % of their distance apart: the fit says so."""
     fit = _fitted(cells)
-    assert contrast[0] < stand_ins[0] < contrast[1]
+    assert contrast[0] < stand_ins[-1] < contrast[1]
     off = np.sqrt(np.sum(fit.between, axis=1)) / np.linalg.norm(_lights(), axis=1)
     assert doubt[0] <= np.median(off) < doubt[1]
 
 
 def test_linear_photos_have_no_contrast_to_be_fitted(stand_ins):
     start = Flashlights(_lights(), 0 * _lights(), np.zeros(COUNT), np.zeros(4), 0.0, np.zeros(3))
-    fit = common_motion.at_best_contrast(start, _evidence(4000), (1.0,))
-    assert stand_ins == [1.0]
+    fit = joint_search.at_best_contrast(start, _evidence(4000), (1.0,))
+    assert stand_ins == [1.0, 1.0]
     assert np.max(fit.between) == 0
 
 
@@ -105,6 +101,6 @@ def test_the_stated_error_covers_the_other_fits(stand_ins):
 
 def test_the_variance_of_a_mixture_is_about_the_fit_that_is_chosen():
     places = np.array([[[0.0, 0.0, 1.0]], [[0.0, 0.0, 3.0]]])
-    about_first = common_motion.variance_about(places[0], places, np.array([1.0, 1.0]))
+    about_first = joint_search.variance_about(places[0], places, np.array([1.0, 1.0]))
     np.testing.assert_allclose(about_first, [[0.0, 0.0, 2.0]])
-    assert common_motion.variance_about(places[0], places, np.array([1.0, 1e-6])).max() < 1e-5
+    assert joint_search.variance_about(places[0], places, np.array([1.0, 1e-6])).max() < 1e-5

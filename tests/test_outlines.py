@@ -8,21 +8,16 @@ import pytest
 from ball_shadows import EYE, HEIGHT, MIDDLE, RADIUS, WIDTH, ball_camera, drawn, hits_ball, photographed
 from flashlight_photos import looking_at
 
-from calibration.flashlight import common_motion
-from calibration.flashlight.common_motion import same_shadows
-from calibration.flashlight.fit import FlashlightFit
-from calibration.flashlight.model import Evidence, Flashlights, free_tangent
 from calibration.flashlight.outline_lights import OUTLINES_WRONG
 from calibration.ground.ground_field import GroundField, fit_ground_field
 from calibration.ground.ground_shadows import GroundShadows, find_shadows
 from calibration.ground.mirror_highlights import MirrorHighlights, find_highlights
 from calibration.ground.seams import without_seams
-from calibration.lights.ground_cells import GroundCells, ground_points
+from calibration.lights.ground_cells import ground_points
 from calibration.outlines.carried_light import offset_by_outlines
 from calibration.outlines.coherence import PENUMBRA, residuals, softness
 from calibration.outlines.metric_cues import MetricCues
 from calibration.outlines.outline_maps import PIXEL_ERROR, outline_maps, with_cues
-from calibration.outlines.relocate import likely_places
 from calibration.outlines.shadow_start import STARTS, shadow_starts
 from calibration.outlines.terms import DROP_OUTLINE, FALSE_SPOT, OutlineTerms
 from calibration.pose import Pose
@@ -86,37 +81,6 @@ def test_outlines_show_where_the_led_sits_beside_its_phones_lens(ball):
         (found - offset)[:2]
     ) < 7  # of 18; a pixel is 2.2 mm
     assert sigma[:2].max() < 5
-
-
-@pytest.mark.slow
-def test_a_lost_light_is_found_again_among_many_places(ball):
-    """From 26 degrees and 30 % off; the cost of each place is the one of all outlines with the light there."""
-    camera, lights, maps = ball
-    every = np.ones(len(lights), bool)
-    terms = OutlineTerms(maps, EYE, camera.ground_height, every, every)
-    k, turn = 4, 0.45
-    spun = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]) @ lights[k]
-    lost = np.where(np.arange(len(lights))[:, None] == k, 1.3 * spun, lights)
-    places = likely_places(terms, lost, k, np.stack([lost[k], lost[k] + 50]))
-    trials = np.where(np.arange(len(lights))[:, None] == k, places[0], lights)
-    cosine = places[0] @ lights[k] / np.linalg.norm(places[0]) / np.linalg.norm(lights[k])
-    assert np.degrees(np.arccos(cosine)) < 3
-    assert np.linalg.norm(places[0]) == pytest.approx(np.linalg.norm(lights[k]), rel=0.2)
-    every_ray = terms.cost(trials) + terms.vagueness(k, places[:1])[0]
-    assert terms.costs(lost, k)(places[:1], 1.0)[0] == pytest.approx(every_ray, rel=1e-9)
-
-
-@pytest.mark.slow
-def test_a_light_is_found_again_from_the_other_side(ball):
-    """From half around, two thirds too near: no fine grid about that start reaches its place."""
-    camera, lights, maps = ball
-    every = np.ones(len(lights), bool)
-    terms = OutlineTerms(maps, EYE, camera.ground_height, every, every)
-    k = 4
-    lost = np.where(np.arange(len(lights))[:, None] == k, lights[k] * [-0.4, -0.4, 0.4], lights)
-    places = likely_places(terms, lost, k, np.stack([lost[k], lost[k] + 50]))
-    cosine = places[0] @ lights[k] / np.linalg.norm(places[0]) / np.linalg.norm(lights[k])
-    assert np.degrees(np.arccos(cosine)) < 4
 
 
 def test_a_penumbra_is_wider_the_higher_its_edge_and_the_lower_its_light(ball):
@@ -268,40 +232,6 @@ def test_a_part_that_is_lit_as_the_ground_is_makes_right_lights_contradict_unles
     misfit = [OutlineTerms(maps, EYE, 0.0, every, every).misfit(lights) for maps in (tight, wide)]
     assert (misfit[0] > DROP_OUTLINE).mean() > OUTLINES_WRONG
     assert np.median(misfit[1]) < 0.3 and (misfit[1] < DROP_OUTLINE).all()
-
-
-def test_the_homology_of_lights_changes_no_shadow(ball):
-    _, lights, maps = ball
-    every = np.ones(len(lights), bool)
-    terms = OutlineTerms(maps, EYE, 0.0, every, every)
-    moved = same_shadows(lights, 0.1, terms)
-    assert np.median(np.linalg.norm(moved - lights, axis=1) / np.linalg.norm(lights, axis=1)) > 0.04
-    assert np.abs(terms.misfit(moved) - terms.misfit(lights)).max() < 0.35
-
-
-def test_the_scan_of_the_common_motion_goes_on_past_its_first_starts(ball, monkeypatch):
-    """The posterior is a parabola about lights far along the motion that no shadow shows."""
-    _, lights, maps = ball
-    every = np.ones(len(lights), bool)
-    points, centre = np.zeros((1, 3)), np.zeros(3)
-    cells = GroundCells(points, np.ones((len(lights), 1, 3)), every[:, None], centre, EYE, 566.0)
-    terms = OutlineTerms(maps, EYE, 0.0, every, every)
-    evidence = replace(Evidence.of(cells, np.ones(len(lights)), 0.0), outlines=terms)
-    reach = np.linalg.norm(lights, axis=1)
-
-    def joint(places, evidence, misfit, priors, like):
-        flashlights = replace(like, positions=places)
-        fit = FlashlightFit(flashlights, evidence, evidence.weight, priors, free_tangent)
-        return float(1e4 * np.mean(np.linalg.norm(places - lights, axis=1) / reach) ** 2), fit, misfit
-
-    monkeypatch.setattr(common_motion, "_joint", joint)
-    start = same_shadows(lights, 0.3, terms)
-    like = Flashlights(start, start, np.zeros(len(start)), np.zeros(4), 0.0, centre)
-    found = common_motion.best_common_motion(start, evidence, common_motion.SMALL, like).flashlights.positions
-    off = [np.median(np.linalg.norm(one - lights, axis=1) / reach) for one in (start, found)]
-    step = np.median(np.linalg.norm(same_shadows(lights, common_motion.SMALL[-1], terms) - lights, axis=1) / reach)
-    assert off[0] > 2 * step
-    assert off[1] < step
 
 
 def _from_the_side() -> SideView:

@@ -4,7 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flashlight_photos import AMBIENT, CAMERA, LOBE, POSED_CAMERA, POWER, WORLD_FROM_CAMERA, Recipe, photograph
+from flashlight_photos import (
+    AMBIENT,
+    CAMERA,
+    LOBE,
+    POSED_CAMERA,
+    POWER,
+    WORLD_FROM_CAMERA,
+    Recipe,
+    handheld_lights,
+    photograph,
+)
 
 from calibration.flashlight.fit import FlashlightFit, collect, first_guess, fit_flashlights, without_gloss
 from calibration.flashlight.light_estimate import locate_lights
@@ -13,9 +23,9 @@ from calibration.flashlight.model import (
     PER_FLASHLIGHT,
     Flashlights,
     Priors,
-    _jacobian,
     _model,
     free_tangent,
+    jacobian,
     log_irradiance,
 )
 from calibration.flashlight.uncertainty import beam_error, unseen_error
@@ -44,6 +54,19 @@ def test_positions_are_found_to_half_a_per_cent_despite_object_shadows_and_textu
     assert np.median(errors) < 0.005
     assert errors.max() < 0.02
     assert all(light.used for light in found.lights)
+
+
+@pytest.mark.parametrize(
+    ("near", "reach"), [(0.24, (380, 850)), (0.35, (600, 1400)), (0.6, (220, 400)), (2.2, (250, 700))]
+)
+def test_lights_are_found_wherever_the_camera_stands(near, reach):
+    """From a coin seen from 150 mm to a chair seen from 1.4 m: a hand holds the light as far away as ever."""
+    recipe = Recipe(near=near, lights=handheld_lights(12, np.random.default_rng(7), reach))
+    truth = photograph(recipe)
+    found = locate_lights(truth.stack, recipe.posed_camera(), np.ones(12, bool))
+    errors = truth.errors(found.lights)
+    assert all(light.used for light in found.lights)
+    assert np.median(errors) < 0.03
 
 
 def test_positions_lie_within_their_stated_sigma(truth, found):
@@ -81,15 +104,15 @@ def test_noise_and_misfit_alone_are_of_the_size_of_the_error(truth, found):
     assert 0.1 < np.median(np.linalg.norm(truth.off(found.lights), axis=1) / sigma) < 2
 
 
-def test_the_jacobian_is_that_of_the_model(truth):
+def test_thejacobian_is_that_of_the_model(truth):
     evidence, _ = collect(truth.stack, POSED_CAMERA, every(truth.stack))
     positions = np.stack([light.position for light in truth.lights])
     axes = np.stack([light.axis for light in truth.lights])
     n, beam = len(positions), np.array([1.5, 0.4, -0.3, 0.2])
     flashlights = Flashlights(positions, positions + 500 * axes, np.linspace(-0.1, 0.1, n), beam, 0.02, np.zeros(3))
     step = np.random.default_rng(3).normal(size=PER_FLASHLIGHT * n + len(beam) + 4) * 1e-4
-    there, back = (log_irradiance(flashlights.moved(s, 0.0, 600.0), evidence) for s in (step, -step))
-    flashlight, shared = _jacobian(flashlights, evidence)
+    there, back = (log_irradiance(flashlights.moved(s, 0.0), evidence) for s in (step, -step))
+    flashlight, shared = jacobian(flashlights, evidence)
     linear = (
         np.einsum("kjp,kp->kj", flashlight, step[: PER_FLASHLIGHT * n].reshape(-1, PER_FLASHLIGHT))
         + shared @ step[PER_FLASHLIGHT * n : -3]

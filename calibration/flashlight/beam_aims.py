@@ -1,34 +1,28 @@
 """Where beams point and lights are, looked for anew: a beam with a hot centre or a ring has many local minima."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from calibration.flashlight.fit import FlashlightFit, hemisphere, may_be_misplaced, misfits
+from calibration.flashlight.fit import misfits
 from calibration.flashlight.model import Evidence, Flashlights, Samples, across, cell_residuals, log_irradiance
 
 OFF_AXIS = tuple(np.radians([0.0, 7.0, 14.0, 21.0, 28.0, 35.0]))  # of the rings of trial axes, from where people aim
 PER_RING = 6  # trial axes on the first ring; the others have as many more
 EVERY = 3  # of the ground's cells: many, to tell two aims apart
 CLEARLY = 0.9  # of the residual with the present aim: better aims are taken
-ELSEWHERE = 2.0  # times the usual angle between a beam and the way to where all aim
-STEADY = 0.1  # rad, of that angle: hands aim no better
 
 
-def looked_for_aims(
-    flashlights: Flashlights, evidence: Evidence, weight: Samples, photos: Sequence[int] | None = None
-) -> Flashlights:
+def looked_for_aims(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> Flashlights:
     """Return the state with the aims (and powers) of least median absolute residual, places and beam held.
 
     Args:
         weight: of the samples, as a fit left them: they tell the ground's albedo.
-        photos: whose aims are looked for; None: all.
     """
     thin = _without_albedo(flashlights, evidence, weight)
     targets, power = flashlights.targets.copy(), flashlights.log_power.copy()
-    for k in range(len(targets)) if photos is None else photos:
+    for k in range(len(targets)):
         own = thin.at(thin.weight[k] > 0)
         if not len(own.cells.points):
             continue
@@ -39,37 +33,6 @@ def looked_for_aims(
         if size[best] < CLEARLY * size[0]:
             targets[k], power[k] = trials[best], offset[best]
     return replace(flashlights, targets=targets, log_power=power)
-
-
-def in_doubt(fit: FlashlightFit) -> Bool[np.ndarray, " photos"]:
-    """Return which photos misfit, or have a beam that misses where all aim by twice the usual angle.
-
-    From half its distance, aimed past the ground, a light may shine on it as from its true place.
-    """
-    away = fit.flashlights.aim - fit.flashlights.positions
-    cosine = (away * fit.flashlights.axes()).sum(1) / np.linalg.norm(away, axis=1)
-    angle = np.arccos(np.clip(cosine, -1, 1))
-    return may_be_misplaced(fit) | (angle > ELSEWHERE * max(float(np.median(angle)), STEADY))
-
-
-def places_by_shading(
-    flashlights: Flashlights, evidence: Evidence, weight: Samples, k: int, count: int
-) -> Float[np.ndarray, "count 3"]:
-    """Return the places (world) of least median absolute residual of light k, its beam aimed as suits each, best first.
-
-    Tried are where it is, and places all around that a hand may hold it at.
-
-    Args:
-        weight: of the samples, as a fit left them: they tell the ground's albedo.
-        count: of the places, at most; none where photo k shows no ground.
-    """
-    thin = _without_albedo(flashlights, evidence, weight)
-    own = thin.at(thin.weight[k] > 0)
-    places = np.concatenate([flashlights.positions[k : k + 1], *hemisphere(evidence.cells)])
-    if not len(own.cells.points):
-        return places[:0]
-    least = [_misfits(flashlights, own, k, one, _trial_targets(flashlights.aim, one))[0].min() for one in places]
-    return places[np.argsort(least, kind="stable")[:count]]
 
 
 def _without_albedo(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> Evidence:

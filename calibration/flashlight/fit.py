@@ -7,18 +7,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from calibration.flashlight.beam_profile import EXTRA_TERMS
+from calibration.flashlight.descent import RobustWeights, refine
 from calibration.flashlight.duplicates import refuse_still_light
-from calibration.flashlight.model import (
-    Evidence,
-    Flashlights,
-    Priors,
-    RobustWeights,
-    Tangent,
-    cell_residuals,
-    log_irradiance,
-    refine,
-)
+from calibration.flashlight.model import Evidence, Flashlights, Priors, Tangent, cell_residuals, log_irradiance
 from calibration.ground.table_edges import TableEdge, on_table
+from calibration.lights import hand
 from calibration.lights.ground_cells import GroundCells, sample_ground
 from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
@@ -92,7 +85,7 @@ def before_ends(evidence: Evidence, edges: Sequence[TableEdge]) -> Evidence:
 
 
 def hemisphere(cells: GroundCells) -> list[Float[np.ndarray, "candidates 3"]]:
-    """Candidate places of a handheld flashlight, one array per elevation; distances in the camera's own distance."""
+    """Candidate places of a handheld flashlight, world (mm), one array per elevation."""
     azimuth = np.arange(0, 2 * np.pi, np.pi / 8)
     rings = []
     for elevation in np.radians([12.0, 25.0, 40.0, 55.0, 72.0]):
@@ -104,7 +97,7 @@ def hemisphere(cells: GroundCells) -> list[Float[np.ndarray, "candidates 3"]]:
             ],
             -1,
         )
-        rings.append(np.concatenate([cells.centre + d * cells.scale * direction for d in (0.45, 0.7, 1.0, 1.4)]))
+        rings.append(np.concatenate([cells.centre + d * direction for d in hand.DISTANCES]))
     return rings
 
 

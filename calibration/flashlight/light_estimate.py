@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.flashlight.beam_profile import without_splines
+from calibration.flashlight.descent import refine
 from calibration.flashlight.duplicates import earlier_duplicate
 from calibration.flashlight.fit import (
     DROP_RESIDUAL,
@@ -24,18 +25,12 @@ from calibration.flashlight.fit import (
     with_oval_beams,
     without_gloss,
 )
-from calibration.flashlight.model import (
-    Flashlights,
-    Priors,
-    cosines,
-    free_tangent,
-    log_irradiance,
-    refine,
-)
+from calibration.flashlight.model import Flashlights, Priors, cosines, free_tangent, log_irradiance
 from calibration.flashlight.outline_lights import OUTLINE_SIDE, outline_sigma, with_outlines
 from calibration.flashlight.tone_curve import WORST_STEPS, compare_curves
 from calibration.flashlight.uncertainty import beam_error, position_sigma, unseen_error
 from calibration.light import Light, Vector
+from calibration.lights import hand
 from calibration.lights.ground_cells import ground_ends
 from calibration.lights.power import albedo_scale
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
@@ -47,24 +42,22 @@ from capture.photos.photo import PhotoStack
 LOG = logging.getLogger(__name__)
 OTHER_POWER = 3.0  # factor between one flashlight's power in two photos
 POWER_SIGMAS = 6.0  # or in how much the other photos differ, where they do not tell their exposure
-LOWEST = 0.08  # of the camera's distance: no hand holds a flashlight lower
-RANGES = (0.2, 4.0)  # of the camera's distance
 LARGEST_SIGMA = 0.08  # of the range, before HONEST_SHARE
 LARGEST_JOINT_SIGMA = 0.25  # of lights from outlines and shading: the solver's shadow rays take over from there
 FEWEST_USED = 2 / 3  # of the photos that shading alone must place
 BY_SHADING = "lights: placed by how bright the ground is, and by nothing else"
 BY_DOUBTED_SHADING = (
-    BY_SHADING + ", which contradicts itself: this phone or flashlight changes brightness from place to place. Expect "
-    "errors of {:.0%} of a light's distance; photos in light/, or RAW photos, make them exact"
+    BY_SHADING + ", which contradicts itself. Expect errors of {:.0%} of a light's distance; photos in light/, or RAW "
+    "photos, make them exact"
 )
 BY_OUTLINES = (
     "lights: placed by the outlines of shadows and object; how far away they all are, by how bright the ground is. "
-    "This phone or flashlight changes brightness from place to place, so shading alone would misplace them. Expect "
-    "errors of a tenth of a light's distance; photos in light/, or RAW photos, make them exact"
+    "The ground's brightness alone contradicts itself. Expect errors of a tenth of a light's distance; photos in "
+    "light/, or RAW photos, make them exact"
 )
 BY_CUES = (
-    "lights: placed by the outlines of shadows and object; how far away they all are, by {}. This phone or flashlight "
-    "changes brightness from place to place, so shading alone would misplace them"
+    "lights: placed by the outlines of shadows and object; how far away they all are, by {}. The ground's brightness "
+    "alone contradicts itself"
 )
 AMBIGUOUS = 0.1  # of a light's distance, between fits that are about as likely: the user is told
 BY_SEVERAL = (
@@ -141,7 +134,7 @@ def _colour(fit: FlashlightFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:
         powers.append(np.exp(flashlights.log_power - shift))
         ambients.append(flashlights.ambient * np.exp(-shift))
     scale = albedo_scale(albedos)
-    return np.stack(powers, -1) * scale * cells.scale**2, np.array(ambients) * scale
+    return np.stack(powers, -1) * scale * hand.USUAL**2, np.array(ambients) * scale
 
 
 def _powers_only(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
@@ -174,10 +167,13 @@ def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: l
             why.append(
                 f"only {share[k]:.0%} of the ground is lit as by one flashlight (limit {least_share(share):.0%})"
             )
-        if height[k] < LOWEST * cells.scale:
-            why.append(f"the light would be {height[k]:.0f} above the ground (limit {LOWEST * cells.scale:.0f})")
-        if not RANGES[0] < reach[k] / cells.scale < RANGES[1]:
-            why.append(f"the light would be {reach[k]:.0f} from the middle of the photo")
+        if height[k] < hand.LOWEST:
+            why.append(f"the light would be {height[k]:.0f} mm above the ground (limit {hand.LOWEST:.0f} mm)")
+        if max(hand.NEAREST - reach[k], reach[k] - hand.FARTHEST) > size[k] * reach[k]:
+            why.append(
+                f"the light would be {reach[k]:.0f} mm from the middle of the photo: a hand holds it "
+                f"{hand.NEAREST:.0f} to {hand.FARTHEST:.0f} mm away. Check the size of the board's squares"
+            )
         if size[k] > largest:
             why.append(f"its place is uncertain by {size[k]:.0%} of its distance (limit {largest:.0%})")
         if abs(brighter[k]) > too_bright:

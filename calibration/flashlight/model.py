@@ -2,7 +2,7 @@
 
 Photo k, cell j at p on the ground, flashlight at s with beam axis a, height z, distance d, c = cosine off the axis:
 
-    pixel_kj = albedo_j * (power_k * g(c) * z * scale^2 / d^3 + ambient)
+    pixel_kj = albedo_j * (power_k * g(c) * z * USUAL^2 / d^3 + ambient), USUAL of calibration.lights.hand
     log g(c) = m log c + r2 u^2 + r3 u^3 + ..., u = 1 - c
 
 Splines of u may be added to log g: see calibration.flashlight.beam_profile.
@@ -24,15 +24,16 @@ from scipy.sparse import csr_array
 
 from calibration.flashlight.beam_profile import SMOOTH_TERMS, derivatives
 from calibration.flashlight.beam_profile import log_gain as beam_log_gain
+from calibration.lights import hand
 from calibration.lights.ground_cells import GroundCells
 from calibration.outlines.terms import OutlineTerms
-from capture.checks.robust import spread
 
 NOISE = 0.01  # relative error granted to a cell; the widths of all priors count in this unit
 FLOOR = 0.001  # of full scale: what quantisation and stray light add
 PER_FLASHLIGHT = 7  # position 3, a point on the beam axis 3, log power 1; two more where beams are oval
 OVAL_ANGLE = np.radians(40.0)  # off the axis, where the two terms of an oval beam are stated
 LOWEST_COSINE = 0.05  # beyond 87 degrees off the axis the beam means nothing
+LAMP = 10.0  # mm above the ground, where a lamp would lie on the table
 MAX_STEP = 0.25  # of the flashlight's distance, per iteration
 
 Samples = Float[np.ndarray, "photos cells"]
@@ -61,15 +62,15 @@ class Flashlights:
         beam = self.targets - self.positions
         return beam / np.linalg.norm(beam, axis=-1, keepdims=True)
 
-    def moved(self, step: Float[np.ndarray, " full"], height: float, scale: float) -> "Flashlights":
-        """Return the state after a step; flashlights stay above the ground and steps are limited."""
+    def moved(self, step: Float[np.ndarray, " full"], height: float) -> "Flashlights":
+        """Return the state after a step; flashlights stay above the ground (z = height) and steps are limited."""
         n, own = len(self.positions), self.per_flashlight()
         flashlight, rest = step[: own * n].reshape(n, own), step[own * n :]
         reach = MAX_STEP * np.linalg.norm(self.positions - self.aim, axis=1)
         size = np.linalg.norm(flashlight[:, :3], axis=1)
         flashlight = flashlight * np.minimum(1, reach / np.maximum(size, 1e-12))[:, None]
         positions = self.positions + flashlight[:, :3]
-        positions[:, 2] = np.maximum(positions[:, 2], height + 0.02 * scale)
+        positions[:, 2] = np.maximum(positions[:, 2], height + LAMP)
         terms = len(self.beam)
         return Flashlights(
             positions,
@@ -87,11 +88,11 @@ class Priors:
     """Prior sigmas in units of one cell's NOISE: an error of 1 % of power counts as much as one cell off by 1 %."""
 
     log_power: float = 0.01  # one flashlight on one battery: 1 % stays harmless under 3 % jitter and 8 % drift
-    aim: float = 0.3  # of the scale: by how much single beams miss the common aim
-    aim_mean: float = 0.5  # of the scale: by how much the common aim misses the middle of the photo
+    aim: float = hand.AIM  # mm by which single beams miss the common aim
+    aim_mean: float = hand.AIM_MEAN  # mm by which the common aim misses the middle of the photo
     beam: float = 5.0  # m, r2, r3, r4
     ring: float = 20.0  # splines
-    ambient: float = 0.2  # of a flashlight at the distance `scale`
+    ambient: float = 0.2  # of a flashlight at a hand's usual distance
     power_outlier: float = 0.1  # a photo this far (log) from the common power is another exposure: Geman-McClure
     oval: float = 0.02  # a beam without any such misfit keeps its accuracy (0.05 to 0.06 % in simulations)
 
@@ -121,7 +122,7 @@ class Evidence:
 
 
 def log_irradiance(flashlights: Flashlights, evidence: Evidence) -> Samples:
-    """The log irradiance of flashlight plus ambient at every ground cell, relative to power 1 at distance `scale`."""
+    """Return the log irradiance at every cell, relative to a flashlight of power 1 at a hand's usual distance."""
     return _model(flashlights, evidence)[0]
 
 
@@ -156,9 +157,7 @@ def _compute(flashlights: Flashlights, evidence: Evidence):
     if flashlights.oval is not None:
         log_gain = log_gain + np.einsum("kjp,kp->kj", _oval_terms(toward, cosine, axes), flashlights.oval)
     z = flashlights.positions[:, 2] - evidence.height
-    log_flash = (
-        flashlights.log_power[:, None] + log_gain + np.log(z * evidence.cells.scale**2)[:, None] - 3 * np.log(distance)
-    )
+    log_flash = flashlights.log_power[:, None] + log_gain + np.log(z * hand.USUAL**2)[:, None] - 3 * np.log(distance)
     flash = np.exp(log_flash)
     total = flash + flashlights.ambient
     return np.log(total), distance, toward, cosine, flash / total, total
@@ -174,7 +173,7 @@ def _oval_terms(
     return np.stack([(a**2 - b**2) * size, 2 * a * b * size], -1)
 
 
-def _jacobian(flashlights: Flashlights, evidence: Evidence):
+def jacobian(flashlights: Flashlights, evidence: Evidence):
     """Derivatives of the log irradiance: (photos, cells, own) by each photo's, (photos, cells, terms + 1) by the rest.
 
     The turn of the oval's terms with flashlight and axis is neglected: these terms are a few per cent of the gain.
@@ -220,13 +219,13 @@ def _median(values: Float[np.ndarray, "rows n"], known: Bool[np.ndarray, "rows n
 
 def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
     """Return the residuals of the priors, divided by their sigmas, and their derivatives (rows x full)."""
-    n, terms, scale = len(flashlights.positions), len(flashlights.beam), evidence.cells.scale
+    n, terms = len(flashlights.positions), len(flashlights.beam)
     own = flashlights.per_flashlight()
     full = own * n + terms + 4
     jac = np.zeros((3 * n + terms + 4 + (own - PER_FLASHLIGHT) * n, full))
     first, second = across(flashlights.axes())
     miss = flashlights.targets - flashlights.aim
-    width = priors.aim * scale
+    width = priors.aim
     rows = np.arange(n)
     for offset, basis in ((0, first), (n, second)):
         for x in range(3):
@@ -239,7 +238,7 @@ def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
         np.full(min(terms, SMOOTH_TERMS), priors.beam),
         np.full(max(terms - SMOOTH_TERMS, 0), priors.ring),
         priors.ambient,
-        np.full(3, priors.aim_mean * scale),
+        np.full(3, priors.aim_mean),
     ]
     jac[3 * n : 3 * n + len(rest), rest] = np.diag(1 / widths)
     oval = np.zeros(0) if flashlights.oval is None else flashlights.oval.T.ravel() / priors.oval
@@ -282,6 +281,13 @@ def free_tangent(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
     return out
 
 
+def pulled(jacobian: tuple[np.ndarray, np.ndarray], weighted: Samples) -> Float[np.ndarray, " full"]:
+    """Return J' times weighted residuals of the cells, in the full coordinates."""
+    flashlight, shared = jacobian
+    by_photo = np.einsum("kjp,kj->kp", flashlight, weighted).ravel()
+    return np.concatenate([by_photo, np.einsum("kj,kjg->g", weighted, shared), np.zeros(3)])
+
+
 def normal_equations(flashlights: Flashlights, evidence: Evidence, weight: Samples, priors: Priors):
     """Return J' W J and J' W r in the full coordinates with priors; albedo is eliminated by its Schur complement.
 
@@ -290,7 +296,7 @@ def normal_equations(flashlights: Flashlights, evidence: Evidence, weight: Sampl
     """
     n, own = len(flashlights.positions), flashlights.per_flashlight()
     residual = cell_residuals(flashlights, evidence, weight)
-    flashlight, shared = _jacobian(flashlights, evidence)
+    flashlight, shared = jacobian(flashlights, evidence)
     cut = own * n
     full = cut + shared.shape[-1] + 3
     weighted = weight[..., None] * flashlight
@@ -306,9 +312,7 @@ def normal_equations(flashlights: Flashlights, evidence: Evidence, weight: Sampl
         matrix[block, cut:-3] += mixed[k]
         matrix[cut:-3, block] += mixed[k].T
     matrix[cut:-3, cut:-3] += np.einsum("kj,kjg,kjh->gh", weight, shared, shared, optimize=True)
-    downhill = np.zeros(full)
-    downhill[:cut] = np.einsum("kjp,kj->kp", weighted, residual).ravel()
-    downhill[cut:-3] = np.einsum("kj,kjg->g", weight * residual, shared)
+    downhill = pulled((flashlight, shared), weight * residual)
     value, jac = _prior_terms(flashlights, evidence, priors)
     if evidence.outlines is not None:
         more, slopes = evidence.outlines.rows(flashlights.positions)
@@ -324,60 +328,3 @@ def cost(flashlights: Flashlights, evidence: Evidence, weight: Samples, priors: 
     value = _prior_terms(flashlights, evidence, priors)[0]
     outlines = 0.0 if evidence.outlines is None else evidence.outlines.cost(flashlights.positions)
     return outlines + 0.5 * float((weight * cell_residuals(flashlights, evidence, weight) ** 2).sum() + value @ value)
-
-
-@dataclass(frozen=True)
-class RobustWeights:
-    """Robust weights of the samples by residual: Cauchy far from the solution, Tukey (which drops outliers) near it."""
-
-    cut: float  # in robust standard deviations of all residuals
-    forgets: bool
-    narrowest: float = 0.003  # log units; residuals of a perfect capture must not shrink the scale to nothing
-
-    def __call__(self, residual: Samples, evidence: Evidence) -> Samples:
-        known = evidence.weight > 0
-        sigma = max(spread(residual[known]), self.narrowest)
-        x = residual / (self.cut * sigma)
-        vote = np.where(np.abs(x) < 1, (1 - x**2) ** 2, 0.0) if self.forgets else 1 / (1 + x**2)
-        return evidence.weight * vote
-
-
-def descend(
-    flashlights: Flashlights, evidence: Evidence, weight: Samples, priors: Priors, tangent: Tangent, damping: float
-):
-    """Take one Levenberg-Marquardt step with fixed weights; return state (unchanged if no step is better) and damping.
-
-    Marquardt, SIAM J. Appl. Math. 11 (1963): the damping scales the diagonal.
-    """
-    matrix, downhill = normal_equations(flashlights, evidence, weight, priors)
-    basis = csr_array(tangent(flashlights))  # a few entries per row: dense products would cost as much as all the rest
-    matrix, downhill = basis.T @ matrix @ basis, basis.T @ downhill
-    before = cost(flashlights, evidence, weight, priors)
-    for _ in range(6):
-        step = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)) + 1e-12 * np.eye(len(matrix)), downhill)
-        trial = flashlights.moved(basis @ step, evidence.height, evidence.cells.scale)
-        if cost(trial, evidence, weight, priors) <= before:
-            return trial, max(damping / 16, 1e-10)
-        damping *= 4
-    return flashlights, damping
-
-
-def ground_cells_of(weight: Samples, evidence: Evidence) -> Bool[np.ndarray, " cells"]:
-    """Return which cells behave like ground: at least 3 of their photos, and a quarter, keep 0.3 of their weight."""
-    least = 0.25  # an object's cell agrees with the ground's shading by chance in fewer photos
-    valid = (weight > 0.3 * evidence.weight) & (evidence.weight > 0)
-    return valid.sum(0) >= np.maximum(least * (evidence.weight > 0).sum(0), 3)
-
-
-def refine(
-    flashlights: Flashlights, evidence: Evidence, priors: Priors, tangent: Tangent, schedule: tuple[RobustWeights, ...]
-):
-    """Take one Levenberg-Marquardt step per entry of the schedule; return the state and the samples' final weights."""
-    damping, weight = 1e-2, evidence.weight
-    residual = cell_residuals(flashlights, evidence, np.zeros_like(weight))
-    for votes in schedule:
-        weight = votes(residual, evidence)
-        weight = weight * ground_cells_of(weight, evidence)
-        flashlights, damping = descend(flashlights, evidence, weight, priors, tangent, damping)
-        residual = cell_residuals(flashlights, evidence, weight)
-    return flashlights, weight

@@ -2,42 +2,26 @@
 
 A phone that lifts shadows or bends contrast, and a hot beam, make the shading of each photo misleading. Outlines do not
 depend on brightness. They leave four numbers free that all lights share (the silhouette fixes three of these loosely);
-the shading of all photos together decides them (common_motion). Both are fitted together from rough starts, with
-shading trusted only as far as its own misfit allows. Photos whose shadows the picture cuts are located last.
+the shading of all photos together decides them. Both are fitted together from rough starts (joint_search), with shading
+trusted only as far as its own misfit allows.
 """
 
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from operator import itemgetter
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from calibration.flashlight.beam_aims import in_doubt, looked_for_aims, places_by_shading
-from calibration.flashlight.common_motion import (
-    CONTRASTS,
-    LOOSE,
-    at_best_contrast,
-    passed_again,
-    searched,
-)
 from calibration.flashlight.fit import (
-    FAR,
     MIN_GROUND,
-    NEAR,
     FlashlightFit,
     does_not_follow,
 )
+from calibration.flashlight.joint_search import CONTRASTS, at_best_contrast, searched
 from calibration.flashlight.model import (
-    PER_FLASHLIGHT,
     Evidence,
-    Flashlights,
-    cell_residuals,
-    cost,
-    free_tangent,
     normal_equations,
-    refine,
 )
 from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows, find_shadows, of_one_ground
@@ -46,20 +30,15 @@ from calibration.ground.table_edges import TableEdge
 from calibration.lights.ground_cells import beyond_ends, ground_points
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
 from calibration.outlines.outline_maps import outline_maps, with_cues
-from calibration.outlines.relocate import likely_places
 from calibration.outlines.shadow_start import shadow_starts
 from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
 from calibration.posed_camera import PosedCamera
-from capture.checks.robust import spread
 from capture.photos.photo import PhotoStack
 
 LOG = logging.getLogger(__name__)
 OUTLINE_SIDE = 504  # px: grain and noise of larger pictures make outlines ragged, smaller ones make them coarse
 THIN = 4  # every fourth ground cell: misfits are smooth over many
 LIT = 0.85  # visibility from which a cell's brightness counts
-UNUSUAL = 2.0  # sigmas of a distance from which a light is looked for again
-ROUNDS = 3  # in which lights are located among those that are known by then, at most
-TRIED = 4  # places of a stray light by outlines, and as many by shading, that are fitted to both
 FEWEST_WHOLE = 8  # photos whose shadows the picture does not cut
 OUTLINES_WRONG = 1 / 3  # of the trusted photos at odds: more than are ever bad, so the object's outline is wrong, ...
 REPAIRED = 0.5  # ... and its hull is right if it leaves less than this share of them at odds
@@ -92,17 +71,16 @@ def with_outlines(
         return None
     starts = [*shadow_starts(terms.maps, shadows.object_mask, posed_camera), by_shading]
     cells = replace(_lit_cells(evidence, shadows, posed_camera), outlines=terms)
-    fit, number = searched(starts, cells)
+    fit = searched(starts, cells)
     wide = _terms(coarse, field, shadows, posed_camera, cues, True) if _at_odds(fit, terms) > OUTLINES_WRONG else None
     if wide is not None and _at_odds(fit, wide) < REPAIRED * _at_odds(fit, terms):
         terms = wide
-        fit, number = searched(starts, replace(cells, outlines=wide))
+        fit = searched([fit.flashlights.positions], replace(cells, outlines=wide))
     if _ground(fit) < MIN_GROUND / THIN:
         return None
-    complete = _completed(fit, cells, starts[number], by_shading)
     # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share
-    contrasts = (1.0,) if stack.is_linear else CONTRASTS
-    found = at_best_contrast(complete.flashlights, replace(cells, outlines=complete.evidence.outlines), contrasts)
+    agreeing = replace(cells, outlines=replace(terms, trusted=~_contradicts(fit)))
+    found = at_best_contrast(fit.flashlights, agreeing, (1.0,) if stack.is_linear else CONTRASTS)
     return replace(found, between=found.between + fit.between) if _ground(found) >= MIN_GROUND / THIN else None
 
 
@@ -157,136 +135,10 @@ def _ground(fit: FlashlightFit) -> int:
     return int((fit.weight.sum(0) > 0).sum())
 
 
-def _is_stray(terms: OutlineTerms, places: Float[np.ndarray, "photos 3"]) -> Bool[np.ndarray, " photos"]:
-    return (terms.misfit(places) > DROP_OUTLINE) | (np.abs(terms.unusual(places)) > UNUSUAL)
-
-
-def _completed(
-    fit: FlashlightFit, cells: Evidence, start: Float[np.ndarray, "photos 3"], by_shading: Float[np.ndarray, "photos 3"]
-) -> FlashlightFit:
-    """Locate the stray lights; search on with all, since the others have bent towards strays that were wrong."""
-    assert fit.evidence.outlines is not None
-    complete = _with_strays(fit, start, by_shading, fit.evidence.outlines.trusted)
-    for _ in range(ROUNDS - 1):
-        outlines = complete.evidence.outlines
-        assert outlines is not None
-        better = None if complete is fit else passed_again(complete.flashlights, replace(cells, outlines=outlines))
-        if better is None:
-            break
-        complete, fit = _with_strays(better, start, by_shading, outlines.trusted), better
-    return complete
-
-
-def _with_strays(
-    fit: FlashlightFit,
-    start: Float[np.ndarray, "photos 3"],
-    by_shading: Float[np.ndarray, "photos 3"],
-    whole: Bool[np.ndarray, " photos"],
-) -> FlashlightFit:
-    """Locate the photos whose shadows are cut, or contradict the others, once these are known; refit all together.
-
-    So are those whose shading misfits, or whose beam points elsewhere than the others': a shadow may agree with the
-    others from a wrong place. Tried for each: where outlines alone put it, where shading alone did, and where it does
-    now, with albedo, beam and power of the others; outlines and shading together decide.
-    """
-    assert fit.evidence.outlines is not None
-    strays = ~whole | _is_stray(fit.evidence.outlines, fit.flashlights.positions) | in_doubt(fit)
-    for _ in range(ROUNDS):
-        if not strays.any():
-            break
-        before = strays
-        fit = _refitted(fit, _located(fit, start, by_shading, strays), np.ones_like(strays))
-        strays = _contradicts(fit)
-        if strays.any():  # a wrong light makes right ones contradict: these come back once it is out
-            fit = _refitted(fit, fit.flashlights, ~strays)
-            strays = _contradicts(fit)
-            fit = _refitted(fit, fit.flashlights, ~strays)
-        if strays.sum() >= before.sum():
-            break
-    return fit
-
-
 def _contradicts(fit: FlashlightFit) -> Bool[np.ndarray, " photos"]:
     """Return which photos the others' shadows, or the ground's shading, contradict."""
     assert fit.evidence.outlines is not None
     return (fit.evidence.outlines.misfit(fit.flashlights.positions) > DROP_OUTLINE) | does_not_follow(fit)
-
-
-def _located(
-    fit: FlashlightFit,
-    start: Float[np.ndarray, "photos 3"],
-    by_shading: Float[np.ndarray, "photos 3"],
-    strays: Bool[np.ndarray, " photos"],
-) -> Flashlights:
-    """Locate each stray light among those that are none."""
-    terms, flashlights = fit.evidence.outlines, fit.flashlights
-    assert terms is not None
-    cut = _cut(fit)
-    for number, k in enumerate(np.flatnonzero(strays).tolist()):
-        LOG.info("placing lights whose shadows are cut or contradict the others, %d of %d", number + 1, strays.sum())
-        alone = ~strays | (np.arange(len(strays)) == k)
-        places = flashlights.positions
-        likely = likely_places(replace(terms, trusted=alone), places, k, np.stack([start[k], places[k]]))
-        lit = places_by_shading(flashlights, fit.evidence, fit.weight, k, TRIED)
-        tries = [_alone(fit, flashlights, k, one, alone, cut) for one in (*likely[:TRIED], *lit, by_shading[k])]
-        flashlights = min(tries, key=itemgetter(1))[0]
-    return flashlights
-
-
-def _alone(
-    fit: FlashlightFit,
-    flashlights: Flashlights,
-    k: int,
-    place: Float[np.ndarray, "3"],
-    trusted: Bool[np.ndarray, " photos"],
-    cut: float,
-) -> tuple[Flashlights, float]:
-    """Fit light k from a place with all others held; return also the cost of everything, to compare its places by.
-
-    Half the weighted sum of squares counts nothing for samples that the fit forgot: the place that forgets most would
-    be the best. So light k's samples cost what the biweight's own function says; see _biweight.
-    """
-    assert fit.evidence.outlines is not None
-    outlines = replace(fit.evidence.outlines, trusted=trusted)
-    evidence = replace(fit.evidence, weight=fit.evidence.weight * trusted[:, None], outlines=outlines)
-    positions, targets, power = flashlights.positions.copy(), flashlights.targets.copy(), flashlights.log_power.copy()
-    positions[k], targets[k], power[k] = place, flashlights.aim, 0.0
-    start = replace(flashlights, positions=positions, targets=targets, log_power=power)
-    start = looked_for_aims(start, fit.evidence, fit.weight, [k])
-    free = PER_FLASHLIGHT - 1  # aim has two coordinates
-
-    def own(state: Flashlights) -> Float[np.ndarray, "full reduced"]:
-        return free_tangent(state)[:, free * k : free * (k + 1)]
-
-    found, weight = refine(start, evidence, LOOSE, own, FAR[:4] + NEAR[-4:])
-    vague = float(outlines.vagueness(k, found.positions[k : k + 1])[0])
-    ground, own_weight = fit.weight.sum(0) > 0, evidence.weight[k]
-    size = cell_residuals(found, evidence, weight)[k]
-    forgotten = float(((own_weight * _biweight(size, cut) - 0.5 * weight[k] * size**2) * ground).sum())
-    return found, cost(found, evidence, weight, LOOSE) + forgotten + vague
-
-
-def _cut(fit: FlashlightFit) -> float:
-    """Return from which residual on (log units) the last fit forgets a sample."""
-    known = (fit.evidence.weight > 0) & (fit.weight.sum(0) > 0)
-    return NEAR[-1].cut * max(spread(fit.residual()[known]), NEAR[-1].narrowest)
-
-
-def _biweight(size: Float[np.ndarray, " n"], cut: float) -> Float[np.ndarray, " n"]:
-    """Return c^2 / 6 (1 - (1 - min(r / c, 1)^2)^3): about r^2 / 2 for small residuals r, constant from c on.
-
-    Beaton and Tukey, Technometrics 16 (1974): its derivative over r is the weight with which samples are fitted.
-    """
-    return cut**2 / 6 * (1 - np.maximum(1 - (size / cut) ** 2, 0.0) ** 3)
-
-
-def _refitted(fit: FlashlightFit, flashlights: Flashlights, trusted: Bool[np.ndarray, " photos"]) -> FlashlightFit:
-    """Refit with the trusted photos alone: a light in a wrong place would carve away what the others need."""
-    assert fit.evidence.outlines is not None
-    outlines = replace(fit.evidence.outlines, trusted=trusted)
-    evidence = replace(fit.evidence, outlines=outlines)
-    flashlights, weight = refine(flashlights, evidence, LOOSE, free_tangent, FAR[:4] + NEAR)
-    return replace(fit, flashlights=flashlights, evidence=evidence, weight=weight)
 
 
 def outline_sigma(fit: FlashlightFit) -> Float[np.ndarray, "photos 3"]:

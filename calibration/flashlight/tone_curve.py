@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from calibration.flashlight.descent import refine
 from calibration.flashlight.fit import LAST, FlashlightFit
-from calibration.flashlight.model import refine
 from capture.photos.photo import srgb_of
 
 CLEARLY_BETTER = 0.85  # residual of another curve over that of sRGB: below, sRGB is doubted

@@ -23,8 +23,9 @@ from jaxtyping import Float
 from scipy.sparse import csr_array
 
 from calibration.flashlight.beam_profile import RING_TERMS
+from calibration.flashlight.descent import refine
 from calibration.flashlight.fit import FAR, LAST, NEAR, OVAL_PHOTOS, FlashlightFit
-from calibration.flashlight.model import NOISE, normal_equations, refine
+from calibration.flashlight.model import NOISE, normal_equations
 from capture.checks.robust import spread
 
 QUADRANTS = 4

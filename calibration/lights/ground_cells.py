@@ -7,14 +7,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from calibration.ground.table_edges import TableEdge, find_table_edges, on_table
+from calibration.lights import hand
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
 
-# Lengths are counted in the distance from the camera to the ground in the middle of the photo, so that nothing here
-# depends on the unit. 0.75 is 450 mm at 600 mm: nearer ground alone determines the lights badly, farther ground is dim.
-RADIUS = 0.9
-CELL = 0.026  # 18 mm at 690 mm: small against the light's distance, large against the grain of a photo
+# Ground as far around as the light is away: less of it determines the lights badly, and farther ground is dim.
+RADIUS = hand.USUAL
+CELL = 0.026  # of the distance from the camera to the ground in the middle of the photo: some 15 px wide
 MIN_PIXELS = 6  # fewer pixels in a cell than this leave its mean noisy
 MAX_SAMPLES, ENOUGH_CELLS = (
     60_000,
@@ -34,7 +34,6 @@ class GroundCells:
     usable: Bool[np.ndarray, "photos cells"]  # no pixel of the cell is clipped
     centre: Float[np.ndarray, "3"]  # ground point in the middle of the photo
     eye: Float[np.ndarray, "3"]  # camera centre
-    scale: float  # distance from eye to centre
 
     def grey(self) -> Float[np.ndarray, "photos cells"]:
         """Return the mean of red, green and blue, which has less noise than each of them."""
@@ -109,7 +108,7 @@ def sample_ground(stack: PhotoStack, posed_camera: PosedCamera, photos: Int[np.n
         )
     centre = points[middle]
     scale = float(np.linalg.norm(centre - eye))
-    near = down & (np.linalg.norm(points - centre, axis=-1) < RADIUS * scale)
+    near = down & (np.linalg.norm(points - centre, axis=-1) < RADIUS)
     near &= _thinned(points, near, centre, scale, len(photos))
     seen = points[near]
     cell = _cell_of_pixel(seen, centre, scale)
@@ -127,4 +126,4 @@ def sample_ground(stack: PhotoStack, posed_camera: PosedCamera, photos: Int[np.n
 
     rgb = np.stack([mean(stack.rgb[k][near]) for k in photos])
     clipped = np.stack([mean(stack.clipped[k][near].astype(np.float64)) > 0 for k in photos])
-    return GroundCells(mean(seen), rgb, ~clipped & (rgb.min(-1) > 0), centre, eye, scale)
+    return GroundCells(mean(seen), rgb, ~clipped & (rgb.min(-1) > 0), centre, eye)

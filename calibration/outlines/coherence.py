@@ -95,56 +95,6 @@ def _heights(maps: OutlineMaps) -> Float[np.ndarray, " heights"]:
     return np.linspace(0, TALLEST * maps.size, HEIGHTS + 1)[1:]
 
 
-class OneLight:
-    """The emptiness of all rays for many places of one light, the others held: a twentieth of the work of `residuals`.
-
-    Rays of photos from the side are left out: places are compared, and the tripod's rays say the same of them.
-
-    Args: as for residuals; photo: the light that is moved; it takes part; every: only every so many-th ray is asked.
-    """
-
-    def __init__(self, maps, lights, eye, used, photo: int, every: int = 1):
-        from calibration.outlines.coherence_kernels import proven_by_others
-
-        self._maps, self._photo = maps, photo
-        asked = np.arange(len(maps.owner)) % every == 0
-        self._mine = asked & (maps.owner == photo)
-        self._views, self._used = np.concatenate([lights, eye[None]]), np.append(used, True).astype(np.uint8)
-        self._soft = np.append(softness(maps, lights), 0.0)
-        others = asked & self._used.astype(bool)[maps.owner] & (maps.owner != photo)
-        self._starts, self._owner = maps.starts[others], maps.owner[others]
-        self._worst = np.empty((len(self._starts), HEIGHTS))
-        others_used = self._used.copy()
-        others_used[photo] = 0
-        where = _where(maps, self._views, others_used, self._soft)
-        proven_by_others(self._starts, self._owner, *where, _heights(maps), self._worst)
-
-    def emptiness_of_others(self, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, "places others"]:
-        """Return the emptiness of the other lights' rays."""
-        from calibration.outlines.coherence_kernels import least_with_places
-
-        maps, photo = self._maps, self._photo
-        found = np.empty((len(places), len(self._starts)))
-        where = (maps.corner, maps.cell, _heights(maps), self._soft, self._worst, places, softness(maps, places), found)
-        least_with_places(self._starts, self._owner, self._views, maps.fields[photo], *where)
-        return found
-
-    def own_emptiness(self, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, "places own"]:
-        """Return the emptiness of the light's own rays: most of the work."""
-        from calibration.outlines.coherence_kernels import least_empty
-
-        maps, mine, photo = self._maps, self._mine, self._photo
-        own, views, soft = np.empty((len(places), mine.sum())), self._views.copy(), self._soft.copy()
-        height, by, first_step = np.empty(mine.sum()), np.empty(mine.sum(), np.int64), maps.first_step[mine]
-        for number, (place, softer) in enumerate(zip(places, softness(maps, places), strict=True)):
-            views[photo], soft[photo] = place, softer
-            where = _where(maps, views, self._used, soft)
-            least_empty(
-                maps.starts[mine], maps.owner[mine], *where, _heights(maps), first_step, own[number], height, by
-            )
-        return own
-
-
 def _where(maps: OutlineMaps, views: np.ndarray, used: np.ndarray, soft: np.ndarray):
     """Return what the kernels need of views and maps."""
     if maps.space is None:

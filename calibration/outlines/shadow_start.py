@@ -9,15 +9,14 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from calibration.lights import hand
 from calibration.outlines.outline_maps import OutlineMaps
 from calibration.posed_camera import PosedCamera
 
 LEANS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.2)  # radians from the upright
-STARTS = 4  # leans that are kept: overlap alone does not tell how tall an object is
+STARTS = 2  # leans that are kept: overlap alone does not tell how tall an object is
 ELEVATIONS = (10, 17, 24, 31, 38, 45, 52, 60, 68, 78)  # degrees
 AZIMUTHS = 24  # at the horizon
-DISTANCES = tuple(np.geomspace(0.7, 3.0, 6))  # of the camera's distance from the foot
-USUAL_DISTANCE = 1.7  # of the camera's distance: shadows tell the direction first
 COARSE = 64  # cells of the maps that are compared
 FINE = 128  # of a hull, whose shadows are nearly the object's
 
@@ -25,7 +24,7 @@ FINE = 128  # of a hull, whose shadows are nearly the object's
 def shadow_starts(
     maps: OutlineMaps, mask: Bool[np.ndarray, "height width"], posed_camera: PosedCamera
 ) -> list[Float[np.ndarray, "photos 3"]]:
-    """Return light positions per photo (world) at USUAL_DISTANCE, where the solid's shadow overlaps its own best.
+    """Return a light per photo (world), a hand's usual distance away, where the solid's shadow overlaps its own best.
 
     One array for each of the STARTS leans that overlap best, the best one first.
 
@@ -33,18 +32,17 @@ def shadow_starts(
         mask: the object, on the pixel grid of the ground field.
     """
     camera = posed_camera.resized(mask.shape[1], mask.shape[0])
-    reach = float(np.linalg.norm(camera.centre - maps.foot))
     hull = _hull(maps, camera)
     solids = [hull] if len(hull) else [_solid(maps, mask, camera, lean) for lean in LEANS]
     cells = FINE if len(hull) else COARSE
     found: list[tuple[float, np.ndarray]] = []
     for solid in solids:
         middle = solid.mean(0)
-        places = _hemisphere(middle, reach)
+        places = _hemisphere(middle)
         overlap = _overlap(maps, solid, places, camera.ground_height, cells)
         away = places[overlap.argmax(0)] - middle
         away /= np.linalg.norm(away, axis=1, keepdims=True)
-        found.append((float(overlap.max(0).mean()), middle + USUAL_DISTANCE * reach * away))
+        found.append((float(overlap.max(0).mean()), middle + hand.USUAL * away))
     found.sort(key=lambda one: -one[0])
     return [places for _, places in found[:STARTS]]
 
@@ -86,7 +84,7 @@ def _solid(maps: OutlineMaps, mask: np.ndarray, camera: PosedCamera, lean: float
     return solid
 
 
-def _hemisphere(middle: Float[np.ndarray, "3"], reach: float) -> Float[np.ndarray, "places 3"]:
+def _hemisphere(middle: Float[np.ndarray, "3"]) -> Float[np.ndarray, "places 3"]:
     directions = []
     for elevation in np.radians(ELEVATIONS):
         count = max(6, int(AZIMUTHS * np.cos(elevation)))
@@ -94,7 +92,7 @@ def _hemisphere(middle: Float[np.ndarray, "3"], reach: float) -> Float[np.ndarra
         across = np.cos(elevation) * np.stack([np.cos(azimuth), np.sin(azimuth)], -1)
         directions.append(np.concatenate([across, np.full((count, 1), np.sin(elevation))], 1))
     every = np.concatenate(directions)
-    return (middle + reach * np.array(DISTANCES)[:, None, None] * every).reshape(-1, 3)
+    return (middle + np.array(hand.DISTANCES)[:, None, None] * every).reshape(-1, 3)
 
 
 def _overlap(maps: OutlineMaps, solid: np.ndarray, places: np.ndarray, ground: float, size: int):

@@ -6,14 +6,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.ground.mirror_highlights import MirrorHighlights
-from calibration.outlines.coherence import OneLight, Residuals, residuals, softness
+from calibration.outlines.coherence import Residuals, residuals
 from calibration.outlines.outline_maps import PIXEL_ERROR, OutlineMaps
 
 DROP_OUTLINE = 1.5  # px: right lights stay below 0.6, but where the picture cuts a shadow
 SERIES = 0.3  # spread of log distances of a handheld light from the object, as an arm moves
 SAME = 6.0  # neighbouring rays that are wrong together; sums of correlations: 8 to 18, of which Cauchy forgives some
 LOOKS = 2  # that are remembered: of a state, and of the step that is tried from it
-AT_ONCE = 8  # places whose own rays are asked before it is known whether more need be
 FALSE_SPOT = 3.0  # sigmas from which a highlight counts less: it may be the hot centre of a beam, or a ring
 
 
@@ -67,30 +66,11 @@ class OutlineTerms:
             misfit[number] = found.misfit(int(photo)) / self.maps.pixel
         return np.nan_to_num(misfit, nan=0.0)
 
-    def unusual(self, positions: Float[np.ndarray, "used 3"]) -> Float[np.ndarray, " used"]:
-        """Return how much nearer or farther than usual in this series each light is, in sigmas."""
-        return self._arms(positions)[1]
-
     def cost(self, positions: Float[np.ndarray, "used 3"]) -> float:
         """Return half the sum of squares whose weighted rows `rows` gives: Cauchy's function."""
         found = self._look(positions, self.trusted)
         size = np.maximum(found.emptiness, 0) / (PIXEL_ERROR * self.maps.pixel * self.blur)
         return float(np.log1p(size**2).sum() / (2 * SAME)) + self.other_cost(positions)
-
-    def costs(self, positions: Float[np.ndarray, "used 3"], k: int) -> "PlaceCosts":
-        """Return the costs with light k, which counts as trusted, at many places."""
-        return PlaceCosts(self, positions, k)
-
-    def vagueness(self, k: int, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, " places"]:
-        """Return what a light's soft edges cost: the normalisation of their likelihood, log sigma per independent ray.
-
-        Without it a light at the horizon, whose outlines tell nothing, would always be the most likely one. It is for
-        comparing places of one light; the fit of all holds it constant, since it would push all lights away together.
-        """
-        n_rays = float((self.maps.owner == np.flatnonzero(self.used)[k]).sum())
-        lift = np.array([0.0, 0.0, self.ground])
-        soft = softness(self.maps, places - lift) * self.maps.size / 2
-        return n_rays / SAME * 0.5 * np.log1p(soft**2)
 
     def other_cost(self, positions: Float[np.ndarray, "used 3"]) -> float:
         """Half the sum of squares of unusual distances, and Geman and McClure's function of highlights.
@@ -144,57 +124,3 @@ class OutlineTerms:
         found = residuals(self.maps, lights, self.eye - lift, used)
         self._looks[:] = [(used, lights, found), *self._looks[: LOOKS - 1]]
         return found
-
-
-class PlaceCosts:
-    """The cost of all outlines with light k at each of many places, the others held.
-
-    What the other lights prove is computed once. The factor of an outline's sigma is `blur`: of wider outlines fewer
-    rays are asked, since neighbours say the same.
-    """
-
-    def __init__(self, terms: OutlineTerms, positions: Float[np.ndarray, "used 3"], k: int):
-        self._terms, self._positions, self._k = terms, positions, k
-        self._lift = np.array([0.0, 0.0, terms.ground])
-        self._lights: dict[int, OneLight] = {}  # by how many rays stand for one
-
-    def __call__(self, places: Float[np.ndarray, "places 3"], blur: float) -> Float[np.ndarray, " places"]:
-        """Return the cost of each place."""
-        return self.lowest(places, blur, len(places))
-
-    def lowest(self, places: Float[np.ndarray, "places 3"], blur: float, count: int) -> Float[np.ndarray, " places"]:
-        """Return the costs of the `count` places where they are lowest, and bounds below them of the others.
-
-        The other lights' rays are cheap to ask, and no cost is negative: a place where they alone cost more than
-        `count` places do altogether is asked no further.
-        """
-        every = int(min(blur, SAME))
-        light = self._light(every)
-        scale, n = every / (2 * SAME), len(places)
-        cost = scale * self._bent(light.emptiness_of_others(places - self._lift), blur)
-        cost += self._terms.vagueness(self._k, places)
-        trials = np.repeat(self._positions[None], n, 0)
-        trials[:, self._k] = places
-        cost += np.array([self._terms.other_cost(one) for one in trials])
-        order, known = np.argsort(cost), np.full(n, np.inf)
-        for begin in range(0, n, AT_ONCE):
-            some = order[begin : begin + AT_ONCE]
-            if begin >= count and cost[some[0]] >= np.partition(known, count - 1)[count - 1]:
-                break
-            known[some] = cost[some] + scale * self._bent(light.own_emptiness(places[some] - self._lift), blur)
-        return np.where(np.isfinite(known), known, cost)
-
-    def _light(self, every: int) -> OneLight:
-        terms, k = self._terms, self._k
-        if every not in self._lights:
-            lights, used = np.ones((len(terms.used), 3)), terms.used.copy()
-            lights[terms.used] = self._positions - self._lift
-            used[terms.used] = terms.trusted | (np.arange(len(self._positions)) == k)
-            photo = int(np.flatnonzero(terms.used)[k])
-            self._lights[every] = OneLight(terms.maps, lights, terms.eye - self._lift, used, photo, every)
-        return self._lights[every]
-
-    def _bent(self, empty: Float[np.ndarray, "places rays"], blur: float) -> Float[np.ndarray, " places"]:
-        """Return the sum of Cauchy's function over each place's rays."""
-        size = np.maximum(empty, 0) / (PIXEL_ERROR * self._terms.maps.pixel * blur)
-        return np.log1p(size**2).sum(1)

@@ -243,7 +243,7 @@ def _judge_lights(say: Judge, facts: dict[str, Any]) -> None:
     if facts["powers_off"]:
         reason = f"{facts['powers_off']} photos are brighter or darker than the flashlight's place explains, by up to "
         reason += f"{np.expm1(facts['largest_power_change']):.0%}; each has been given a power of its own"
-        say("fair", reason, "Lock the exposure, and use one flashlight with a charged battery.")
+        say("fair", reason, "")
     if facts["light_sigma_share"] > LARGE_SIGMA:
         say(
             "fair",

@@ -1,0 +1,234 @@
+"""All lights from outlines of shadows and the shading of all photos together, from rough starts.
+
+The work is bounded by the number of photos: one pass from each start, one from what is best of all of them photo by
+photo, and one short fit per contrast. Photos that are at odds add none.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.flashlight.beam_aims import looked_for_aims
+from calibration.flashlight.beam_profile import EXTRA_TERMS, RING_TERMS
+from calibration.flashlight.descent import refine
+from calibration.flashlight.fit import FAR, NEAR, START_BEAM, FlashlightFit
+from calibration.flashlight.model import (
+    NOISE,
+    Evidence,
+    Flashlights,
+    Priors,
+    Samples,
+    cell_residuals,
+    free_tangent,
+    log_irradiance,
+)
+from capture.checks.robust import spread
+
+LOG = logging.getLogger(__name__)
+AIM_ROUNDS = 2  # of looking for aims, each with the beam that the last one's aims gave
+USUAL_MISFIT = 0.03  # log units, before it is measured
+BLURS = (8.0, 5.0, 3.0, 2.0, 1.4, 1.0)  # factors of an outline's sigma in one pass of the search, ...
+PER_BLUR = 4  # ... and the steps with each
+NO_GROUND = 1e-6  # log units: a misfit of less is that of no cell
+LOST = 1e9  # the cost of lights that no ground follows
+SCATTER = 4.0  # of the negative log posterior between joint fits from near starts: it has many small minima
+ALIKE = 80.0  # ground cells that are wrong together: within a photo 14 to 24 by their correlation, and photos err alike
+CONTRASTS = (1.1, 1.0, 0.9, 0.8, 0.7)  # of log brightness in the picture over that in the scene, that are tried
+CONTRAST_WIDTH = 0.1  # prior sigma of its logarithm about 0: phones lift whole regions that are dark
+_Found = tuple[float, FlashlightFit, float]  # cost of its outlines, fit, misfit of its shading (log units)
+LOOSE = Priors(log_power=0.1, beam=50.0, power_outlier=0.5)  # a hot centre, rings; a phone's tone differs by photo
+
+
+def searched(starts: Sequence[Float[np.ndarray, "photos 3"]], evidence: Evidence) -> FlashlightFit:
+    """Fit to outlines and shading together from rough starts; return the best fit.
+
+    Outlines alone pull all lights too near, and one light that is too near, its beam aimed elsewhere, may agree with
+    its photo. So both are fitted from the first step on, with an outline's sigma that falls to its own (graduated
+    non-convexity) [Blake and Zisserman, Visual Reconstruction (1987)]. A light that is lost from one start is found
+    from another: the last pass begins with each photo's best. `between` of the fit holds what the others say that
+    explain the photos about as well.
+
+    Args:
+        starts: positions, world.
+        evidence: with outlines; photos that these do not trust are placed by their shading.
+    """
+    trusted = _trusted(evidence)
+    found = []
+    for number, one in enumerate(starts):
+        LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", number + 1, len(starts) + 1)
+        found.append(_pass(_held(one, _weighted(trusted, USUAL_MISFIT), None)[0], trusted, USUAL_MISFIT))
+    best = found[int(_posteriors(found, trusted).argmin())]
+    LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", len(starts) + 1, len(starts) + 1)
+    found.append(_pass(_best_of_each(best, found, evidence), trusted, best[2]))
+    posterior = _posteriors(found, trusted)
+    best = found[int(posterior.argmin())]
+    places = np.stack([one[1].flashlights.positions for one in found])
+    weight = np.exp((posterior.min() - posterior) / SCATTER)
+    between = variance_about(best[1].flashlights.positions, places, weight) * evidence.outlines.trusted[:, None]
+    fit = _settled(_best_of_each(best, found, evidence), evidence, best[2])[1]
+    return replace(fit, between=between)
+
+
+def _best_of_each(best: _Found, found: Sequence[_Found], evidence: Evidence) -> Flashlights:
+    """Return the best fit's state, each light where the fit has it that explains its photo best, the others held.
+
+    A photo's shading counts as cells whose errors are independent, its outlines as they do in the fit.
+    """
+    fit = best[1]
+    terms, state = evidence.outlines, fit.flashlights
+    assert terms is not None
+    albedo = (evidence.log_grey - log_irradiance(state, evidence) - cell_residuals(state, evidence, fit.weight))[0]
+    ground = fit.weight.sum(0) > 0
+    cells = (evidence.weight > 0).sum(1) / ALIKE
+    costs, trials = [], []
+    for one in found:
+        trial = replace(one[1].flashlights, beam=state.beam, ambient=state.ambient, aim=state.aim)
+        trial = looked_for_aims(trial, evidence, fit.weight)
+        residual = evidence.log_grey - log_irradiance(trial, evidence) - albedo
+        misfit = [spread(r[m & ground]) for r, m in zip(residual, evidence.weight > 0, strict=True)]
+        moved = np.repeat(state.positions[None], len(cells), 0)
+        moved[np.arange(len(cells)), np.arange(len(cells))] = trial.positions
+        shadows = [
+            replace(terms, trusted=terms.trusted | own).cost(at)
+            for own, at in zip(np.eye(len(cells)) > 0, moved, strict=True)
+        ]
+        costs.append(cells * np.log(np.maximum(misfit, NO_GROUND)) + shadows)
+        trials.append(trial)
+    chosen = np.argmin(costs, axis=0)
+
+    def taken(values: Sequence[np.ndarray]) -> np.ndarray:
+        return np.stack(values)[chosen, np.arange(len(chosen))]
+
+    return replace(
+        state,
+        positions=taken([one.positions for one in trials]),
+        targets=taken([one.targets for one in trials]),
+        log_power=taken([one.log_power for one in trials]),
+    )
+
+
+def _pass(state: Flashlights, evidence: Evidence, misfit: float) -> _Found:
+    """Fit with outlines that are blurred at first."""
+    assert evidence.outlines is not None
+    weighted = _weighted(evidence, misfit)
+    for blur in BLURS:
+        blurred = replace(weighted, outlines=replace(evidence.outlines, blur=blur))
+        state = refine(state, blurred, LOOSE, free_tangent, FAR[:PER_BLUR])[0]
+    return _settled(state, evidence, misfit)
+
+
+def at_best_contrast(start: Flashlights, evidence: Evidence, contrasts: Sequence[float] = CONTRASTS) -> FlashlightFit:
+    """Fit to outlines and shading together under the contrast that explains the photos best.
+
+    A phone that evens out brightness over whole regions shows a share of the differences of log brightness that the
+    light makes. Taken for the light's, these place all lights too far away. The share is one number for all photos: its
+    posterior mean is taken, and `between` of the fit holds what other shares would give. The fit that is returned has
+    beam and powers as they are in the pictures.
+
+    Args:
+        start: places, aims, powers and beam near the answer.
+        evidence: with outlines.
+        contrasts: that are tried, one after the other; 1 alone where the photos are linear.
+    """
+    found: list[_Found] = []
+    state, misfit = start, USUAL_MISFIT
+    for number, one in enumerate(contrasts):
+        LOG.info("fitting the lights under contrast %d of %d", number + 1, len(contrasts))
+        found.append(_settled(state, _flattened(evidence, one), misfit))
+        state, misfit = found[-1][1].flashlights, found[-1][2]
+    shown = [(cost, fit, one * misfit) for one, (cost, fit, misfit) in zip(contrasts, found, strict=True)]
+    surprise = np.log(contrasts) / CONTRAST_WIDTH
+    cost = _posteriors(shown, evidence) + 0.5 * surprise**2  # of the misfit in the pictures
+    weight = np.exp(cost.min() - cost)
+    best = float(weight @ contrasts / weight.sum())
+    near = found[int(np.abs(np.array(contrasts) - best).argmin())][1].flashlights
+    fit = _settled(near, _flattened(evidence, best), misfit)[1]
+    places = np.stack([one.flashlights.positions for _, one, _ in found])
+    between = variance_about(np.einsum("f,fkx->kx", weight / weight.sum(), places), places, weight)
+    return _as_pictured(replace(fit, between=between), evidence)
+
+
+def _flattened(evidence: Evidence, contrast: float) -> Evidence:
+    return replace(evidence, log_grey=evidence.log_grey / contrast)
+
+
+def _as_pictured(fit: FlashlightFit, evidence: Evidence) -> FlashlightFit:
+    """Fit beam, aims and powers to the evidence with the places held, so that they say what the pictures show."""
+    weighted = _weighted(evidence, USUAL_MISFIT)
+    flashlights, weight = _held(fit.flashlights.positions, weighted, fit.flashlights)
+    misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
+    return replace(fit, flashlights=flashlights, weight=weight, evidence=_weighted(evidence, misfit))
+
+
+def _posteriors(found: Sequence[_Found], evidence: Evidence) -> Float[np.ndarray, " found"]:
+    """Return the negative log posteriors of fits to the same evidence, up to a constant that they share.
+
+    The shading counts as cells whose errors are independent, as many as in the fits themselves: log(misfit) for each.
+    """
+    misfit = np.maximum([one[2] for one in found], NO_GROUND)
+    cells = (evidence.weight > 0).sum() / ALIKE
+    return np.array([one[0] for one in found]) + cells * np.log(misfit)
+
+
+def variance_about(
+    chosen: Float[np.ndarray, "photos 3"],
+    places: Float[np.ndarray, "fits photos 3"],
+    weight: Float[np.ndarray, " fits"],
+) -> Float[np.ndarray, "photos 3"]:
+    """Return the variance of a mixture of fits about the one that is chosen, without the variance of each by itself."""
+    return np.einsum("f,fkx->kx", weight / weight.sum(), (places - chosen) ** 2)
+
+
+def _settled(start: Flashlights, evidence: Evidence, misfit: float) -> _Found:
+    """Refine a state near the answer; misfit: of the shading, log units, by which its cells are weighted."""
+    terms = evidence.outlines
+    assert terms is not None
+    weighted = _weighted(evidence, misfit)
+    flashlights, weight = refine(start, weighted, LOOSE, free_tangent, FAR[:8] + NEAR)
+    misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
+    return (
+        terms.cost(flashlights.positions) if (weight > 0).any() else LOST,
+        FlashlightFit(flashlights, _weighted(evidence, misfit), weight, LOOSE, free_tangent),
+        misfit,
+    )
+
+
+def _trusted(evidence: Evidence) -> Evidence:
+    """Return the evidence without the cells of those photos whose outlines are not trusted."""
+    assert evidence.outlines is not None
+    return replace(evidence, weight=evidence.weight * evidence.outlines.trusted[:, None])
+
+
+def _weighted(evidence: Evidence, misfit: float) -> Evidence:
+    """Weight all photos' cells as their misfit (log units) and their likeness allow."""
+    trust = (NOISE / max(misfit, NOISE)) ** 2 / ALIKE
+    return replace(evidence, weight=evidence.weight * trust)
+
+
+def _held(
+    places: Float[np.ndarray, "photos 3"], evidence: Evidence, like: Flashlights | None
+) -> tuple[Flashlights, Samples]:
+    """Fit beam, aims and powers with the places held; return also the samples' weights.
+
+    Where nothing is known of them yet, aims are looked for.
+    """
+    n, centre = len(places), evidence.cells.centre
+    evidence = replace(evidence, outlines=None)
+    if like is not None:
+        return refine(replace(like, positions=places), evidence, LOOSE, _places_held, FAR[:2] + NEAR)
+    beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS + RING_TERMS)]
+    state = Flashlights(places, np.repeat(centre[None], n, 0), np.zeros(n), beam, 0.02, centre)
+    for _ in range(AIM_ROUNDS):
+        state, weight = refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)
+        state = looked_for_aims(state, evidence, weight)
+    return refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)
+
+
+def _places_held(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
+    basis = free_tangent(flashlights)
+    n, free = len(flashlights.positions), flashlights.per_flashlight() - 1
+    columns = np.arange(basis.shape[1])
+    return basis[:, (columns >= free * n) | (columns % free >= 3)]
