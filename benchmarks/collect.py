@@ -19,6 +19,7 @@ from sheet import ROOT, table
 INDEX = "results"  # its sections are newer than the pages, and come first
 ORDER = (
     INDEX,
+    "results_bed",
     "results_deepshadow",
     "results_scenes",
     "results_photos",
@@ -33,7 +34,6 @@ ORDER = (
     "results_desk_lamp",
     "results_captures",
     "results_phone_captures",
-    "results_generated",
     "results_heldout",
     "results_time",
     "results_scale",

@@ -14,7 +14,8 @@ import torch
 from reconstruct.run.presets import preset
 
 FOLDER = Path(__file__).parent.parent / "benchmarks"
-COMMANDS = sorted(path.name for name in ("run_*.py", "read_files.py", "collect.py") for path in FOLDER.glob(name))
+NAMES = ("run_*.py", "bed.py", "read_files.py", "collect.py")
+COMMANDS = sorted(path.name for name in NAMES for path in FOLDER.glob(name))
 PLOTTED = ("collect.py",)  # need matplotlib, of the extra docs
 
 

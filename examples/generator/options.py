@@ -6,9 +6,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-Shape = Literal["table", "chair", "vase", "figurine", "relief", "tower", "boxes", "ball", "bowl", "disc", "rock"]
-Paint = Literal["plain", "two-tone", "spots"]
-Texture = Literal["wood", "cloth", "stone", "plain"]
+Shape = Literal[
+    "table", "chair", "vase", "figurine", "relief", "tower", "boxes", "ball", "bowl", "disc", "rock", "mug", "carton",
+    "saucer", "slipper", "spectacles", "pair",
+]  # fmt: skip
+Paint = Literal["plain", "two-tone", "spots", "grain", "print"]
+Texture = Literal["wood", "cloth", "stone", "plain", "checked", "felt", "newspaper", "white", "black"]
 Optics = Literal["even", "led", "two-leds"]
 
 
@@ -27,7 +30,7 @@ class Thing:
     albedo: tuple[float, float, float] | None = None
     """Share of light that is sent back, red green blue."""
     paint: Paint = "plain"
-    """plain: one colour; two-tone, spots: a second, darker one."""
+    """plain: one colour; two-tone, spots, print: a second, darker one; grain: stripes as of wood."""
     gloss: float = 0.0
     """Strength of the highlight: 0 matt, 0.5 paint or plastic (4 % at normal incidence), 1 lacquer (8 %)."""
     roughness: float = 0.35

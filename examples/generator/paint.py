@@ -20,15 +20,26 @@ TABLE_COLOURS = {  # brightness-weighted reflectance of common surfaces
     "cloth": (0.38, 0.38, 0.40),
     "stone": (0.50, 0.49, 0.46),
     "plain": (0.55, 0.54, 0.52),
+    "checked": (0.60, 0.30, 0.28),
+    "felt": (0.10, 0.16, 0.12),
+    "newspaper": (0.62, 0.60, 0.55),
+    "white": (0.80, 0.79, 0.77),
+    "black": (0.045, 0.045, 0.05),
 }
-CONTRAST = {"wood": 0.35, "cloth": 0.3, "stone": 0.4, "plain": 0.04}  # of the texture
+CONTRAST = {  # of the texture
+    "wood": 0.35, "cloth": 0.3, "stone": 0.4, "plain": 0.04,
+    "checked": 0.2, "felt": 0.25, "newspaper": 0.06, "white": 0.03, "black": 0.15,
+}  # fmt: skip
 GRAIN = {  # sizes in texels, along and across, and strength of what is added up
     "wood": (((160, 3), 1.0), ((40, 1), 0.6), ((300, 30), 0.8)),
     "cloth": (((1, 1), 1.0), ((6, 1), 0.5), ((1, 6), 0.5), ((60, 60), 0.3)),
     "stone": (((1, 1), 1.0), ((5, 5), 0.6), ((25, 25), 0.5)),
     "plain": (((1, 1), 1.0), ((80, 80), 0.5)),
 }
+GRAIN |= {"checked": GRAIN["cloth"], "felt": GRAIN["stone"]}
+GRAIN |= {name: GRAIN["plain"] for name in ("newspaper", "white", "black")}
 TEXELS = 2048
+CHECK, COLUMN, LINE = 24, 52, 4  # texels (mm): squares of the cloth, columns and lines of the newspaper
 INK, PAPER = 0.04, 0.82  # reflectance of a laser print; a card is as white
 DOTS_PER_MM = 6
 MARGIN_MM = 15.0  # white paper around the print
@@ -44,8 +55,13 @@ def albedo_of(mesh: trimesh.Trimesh, thing: Thing) -> Float[np.ndarray, "vertice
         return colour
     low, high = mesh.bounds
     place = (mesh.vertices - low) / (high - low).max()
+    if thing.paint == "grain":
+        rings = 60 * np.hypot(place[:, 1] - 0.8, 0.5 * place[:, 2] + 0.2) + np.sin(6 * place[:, 0])
+        return colour * (0.75 + 0.25 * np.sin(rings))[:, None]
     if thing.paint == "two-tone":
         is_second = place[:, 2] < 0.45 * place[:, 2].max() + 0.04 * np.sin(14 * place[:, 0])
+    elif thing.paint == "print":
+        is_second = (np.floor(place * [7, 7, 9]) @ [1, 2, 3]) % 4 < 1
     else:
         wave = 19.0
         is_second = np.sin(wave * place[:, 0]) * np.sin(wave * place[:, 1] + 1) * np.sin(wave * place[:, 2] + 2) > 0.25
@@ -61,8 +77,23 @@ def table_top(name: str, rng: np.random.Generator) -> Float[np.ndarray, "texels 
         fall = [np.exp(-2 * (np.pi * sigma * f) ** 2) for sigma, f in ((across, rows), (along, columns))]
         smooth = fft.irfft2(noise * fall[0][:, None] * fall[1]).astype(np.float32)
         grain += strength * smooth / smooth.std()
-    grain = np.clip(1 + CONTRAST[name] * grain / grain.std() / 2, 0.2, 1.8)
+    grain = np.clip(1 + CONTRAST[name] * grain / grain.std() / 2, 0.2, 1.8) * _pattern(name, rng)
     return (grain[..., None] * np.array(TABLE_COLOURS[name])).clip(0, 0.95).astype(np.float32)
+
+
+def _pattern(name: str, rng: np.random.Generator) -> Float[np.ndarray, "texels texels"] | float:
+    """Return by how much the woven squares of a cloth, or the print of a newspaper, darken the table top."""
+    texel = np.arange(TEXELS)
+    if name == "checked":
+        dark = np.where(texel // CHECK % 2, 0.55, 1.0)
+        return dark[:, None] * dark
+    if name != "newspaper":
+        return 1.0
+    words = cv2.resize(
+        rng.uniform(size=(TEXELS // LINE, TEXELS // 6)), (TEXELS, TEXELS), interpolation=cv2.INTER_NEAREST
+    )
+    is_ink = (texel % LINE < LINE / 2)[:, None] & (texel % COLUMN < COLUMN - 5) & (words > 0.25)
+    return np.where(is_ink, 0.35, 1.0)
 
 
 def sheet(

@@ -23,6 +23,7 @@ GAP_MM = 15.0  # between board and object
 FILL = 1.05  # how much higher than its content the picture is
 SHADOW_ROOM = 1.6  # of the object's size: ground around it that takes its shadows
 PRINCIPAL_POINT_OFF = (0.006, -0.005)  # of the width: no phone's lens sits right in the middle
+AIM_SHARE = 0.04  # of the distance: by how much a hand-held phone misses the board's middle
 ROLL_DEG = 6.0  # roll of a hand-held phone, one sigma
 LOOK_LOW = 0.7  # of the middle's height: shadows lie on the table
 SIDEWAYS_DEG = (
@@ -35,6 +36,7 @@ SIDE_TRIES, SIDE_STEP_DEG = 20, 5.0  # a view in which the object hides the boar
 MOST_HIDDEN = 0.2  # of the board's corners
 ROOM_TO_WALL_MM = 60.0  # flashlights stay so far before it
 TRIES = 1000
+SEES = (0.53, 0.41)  # of the width, from the picture's middle: a flashlight there is in it, or glares into the lens
 LIGHT_PHONE_FOCAL = 27.0  # of the phone that holds the flashlight, for 35 mm film
 LIGHT_PHONE_DISTORTION = (-0.041, 0.033)
 LED_FROM_LENS_MM = (-13.8, 6.1, 0.0)  # in that phone's camera frame
@@ -154,7 +156,7 @@ def handheld(view: Viewpoint, board: AnyBoard, setup: Setup, rng: np.random.Gene
         if setup.table.wall > 0:
             around = setup.phone.azimuth + SIDEWAYS_DEG * ((around - setup.phone.azimuth + 180) % 360 - 180) / 180
         away = direction(elevation, around)
-        target = centre + np.append(rng.uniform(-25, 25, 2), 0.0)
+        target = centre + np.append(AIM_SHARE * distance * rng.uniform(-1, 1, 2), 0.0)
         level = look_at(target + distance * rng.uniform(0.8, 1.15) * away, target)
         views.append(Viewpoint(view.camera, rolled(level, ROLL_DEG * rng.standard_normal())))
     return views
@@ -216,9 +218,11 @@ def nudged(view: Viewpoint, distance: float, rng: np.random.Generator) -> Viewpo
 def lamps(setup: Setup, count: int, thing: trimesh.Trimesh, board: AnyBoard, rng: np.random.Generator) -> list[Lamp]:
     """Return flashlight positions spread over heights, directions and distances, in random order, aimed by hand.
 
-    Directions are counted from the camera's. A position behind a wall is drawn again, from random numbers of its own.
+    Directions are counted from the camera's. A position behind a wall or in the camera's picture is drawn again, from
+    random numbers of its own.
     """
-    light, azimuth, wall = setup.flashlight, setup.phone.azimuth, wall_of(setup, thing)
+    light, azimuth = setup.flashlight, setup.phone.azimuth
+    wall, fixed = wall_of(setup, thing), tripod(setup, board, thing)
     centre = thing.bounds.mean(0)
     aim = (centre + board_centre(board)) / 2 if setup.further.light_photos else centre
     first, last = light.around
@@ -232,8 +236,16 @@ def lamps(setup: Setup, count: int, thing: trimesh.Trimesh, board: AnyBoard, rng
         sine = low + (high - low) * (i + rng.uniform()) / count  # even over the sphere
         away = direction(float(np.degrees(np.arcsin(sine))), azimuth + first + (last - first) * share)
         position = centre + rng.uniform(*light.reach) * away
-        if wall is not None and wall.hides(position):
-            position = _before(wall, centre, setup, again)
+        for _ in range(TRIES):
+            if not _is_in_the_way(position, wall, fixed):
+                break
+            sine = again.uniform(*np.sin(np.radians(light.height)))
+            away = direction(float(np.degrees(np.arcsin(sine))), azimuth + again.uniform(first, last))
+            position = centre + again.uniform(*light.reach) * away
+        else:
+            raise CaptureError(
+                "wall and picture leave no place for the flashlight. Change --wall, --reach, --height or --around."
+            )
         miss = np.radians(light.aim_error) * rng.standard_normal(3) / np.sqrt(2)
         towards = (aim - position) / np.linalg.norm(aim - position)
         if light.aim_off > 0:
@@ -244,20 +256,14 @@ def lamps(setup: Setup, count: int, thing: trimesh.Trimesh, board: AnyBoard, rng
     return [out[i] for i in rng.permutation(count)]
 
 
-def _before(wall: Upright, centre: Vector, setup: Setup, rng: np.random.Generator) -> Vector:
-    """Return a random place for the flashlight before the wall.
-
-    Raises:
-        CaptureError: there is none.
-    """
-    light = setup.flashlight
-    for _ in range(TRIES):
-        sine = rng.uniform(*np.sin(np.radians(light.height)))
-        away = direction(float(np.degrees(np.arcsin(sine))), setup.phone.azimuth + rng.uniform(*light.around))
-        position = centre + rng.uniform(*light.reach) * away
-        if not wall.hides(position):
-            return position
-    raise CaptureError("the wall leaves no place for the flashlight. Change --wall, --reach, --height or --around.")
+def _is_in_the_way(position: Vector, wall: Upright | None, fixed: Viewpoint) -> bool:
+    """Return whether a flashlight is behind the wall, or the fixed camera sees it."""
+    if wall is not None and wall.hides(position):
+        return True
+    local = fixed.world_from_camera.inverse().apply(position)
+    if local[2] <= 0:
+        return False
+    return bool(np.all(np.abs(local[:2]) <= local[2] * np.array(SEES) * fixed.camera.width / fixed.camera.fx))
 
 
 def direction(elevation: float, azimuth: float) -> Vector:

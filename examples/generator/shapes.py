@@ -239,6 +239,68 @@ def disc() -> Solid:
     return Solid(lambda p: above(p, turned(p, [(0, -1), (16, -1), (16, 7), (0, 7)])), (-17, -17, 0), (17, 17, 8))
 
 
+def mug() -> Solid:
+    """A straight mug with a handle."""
+    outer, inner = [(0, 0), (37, 0), (40, 3), (40, 94)], [(36.5, 94), (36.5, 8), (33, 5), (0, 5)]
+
+    def inside(p: Points) -> Values:
+        handle = np.maximum(ring(p, (40, 0, 48), 25, 5.0), -turned(p, [*inner, (0, 94)]))
+        return above(p, np.minimum(turned(p, outer + inner), handle))
+
+    return Solid(inside, (-41, -41, 0), (71, 41, 95))
+
+
+def carton() -> Solid:
+    """A box as food is sold in, lying or standing."""
+    return Solid(lambda p: box(p, (0, 0, 44), (62, 38, 88)), (-32, -20, 0), (32, 20, 89))
+
+
+def saucer() -> Solid:
+    """A cup on its saucer."""
+    plate = [(0, 0), (26, 0), (28, 2), (62, 10), (64, 13), (60, 13), (27, 6), (0, 6)]
+    outer, inner = [(0, 5), (20, 5), (23, 9), (34, 28), (37, 58)], [(34, 58), (31, 29), (19, 11), (0, 11)]
+
+    def inside(p: Points) -> Values:
+        handle = np.maximum(ring(p, (37, 0, 36), 14, 3.2), -turned(p, [*inner, (0, 58)]))
+        return np.minimum.reduce([turned(p, plate), turned(p, outer + inner), above(p, handle)])
+
+    return Solid(inside, (-65, -65, 0), (65, 65, 59))
+
+
+def slipper() -> Solid:
+    """A shoe without a heel: a closed toe, and an opening into which one sees."""
+
+    def inside(p: Points) -> Values:
+        parts = [rod(p, (46, 4, 6), (46, 4, 10), 22), rod(p, (0, 0, 8), (30, 2, 12), 25)]
+        parts += [rod(p, (-62, 0, 8), (-20, 0, 14), 22)]
+        hollow = melted([rod(p, (24, 2, 22), (-62, 0, 34), 18), rod(p, (-20, 0, 50), (-60, 0, 50), 24)], 8.0)
+        return above(p, np.maximum(melted(parts, 16.0), -hollow))
+
+    return Solid(inside, (-86, -28, 0), (70, 30, 42))
+
+
+def spectacles() -> Solid:
+    """A frame without glasses, standing on its rims and the ends of its temples."""
+
+    def inside(p: Points) -> Values:
+        q = np.abs(p * [1, 0, 0]) + p * [0, 1, 1]
+        parts = [ring(q, (32, 0, 22), 20, 2.6), rod(q, (0, 0, 28), (13, 0, 28), 2.6)]
+        parts += [rod(q, (51, 0, 28), (56, 4, 28), 2.6), rod(q, (56, 4, 28), (55, 84, 26), 2.6)]
+        return above(p, np.minimum.reduce([*parts, rod(q, (55, 84, 26), (53, 112, 2), 2.6)]))
+
+    return Solid(inside, (-60, -4, 0), (60, 116, 46))
+
+
+def pair() -> Solid:
+    """Two things that touch: a ball and a tin."""
+
+    def inside(p: Points) -> Values:
+        tin = np.maximum(np.hypot(p[..., 0] - 21, p[..., 1]) - 21, np.abs(p[..., 2] - 30) - 30)
+        return above(p, np.minimum(tin, ball(p, (-26, 6, 26), 27)))
+
+    return Solid(inside, (-54, -22, 0), (43, 34, 61))
+
+
 SOLIDS: dict[str, Callable[[], Solid]] = {
     "table": table,
     "chair": chair,
@@ -251,4 +313,10 @@ SOLIDS: dict[str, Callable[[], Solid]] = {
     "bowl": bowl,
     "disc": disc,
     "rock": rock,
+    "mug": mug,
+    "carton": carton,
+    "saucer": saucer,
+    "slipper": slipper,
+    "spectacles": spectacles,
+    "pair": pair,
 }

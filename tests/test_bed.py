@@ -1,0 +1,164 @@
+"""The bed: what is drawn, how runs are judged, and what is told of captures that nobody may look into."""
+
+import importlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from examples.generator import poses
+from examples.generator.shapes import build
+
+FOLDER = Path(__file__).parent.parent / "benchmarks"
+SEEDS = (1, 77, 1003)
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    """The modules of benchmarks/ by name, as a command there imports them."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    return importlib.import_module
+
+
+def row(seed: int, outcome: str = "success", cpu_s: float = 40.0, kind: str = "close", **more) -> dict:
+    """A kept row whose numbers give that outcome."""
+    good = {"lights_pct": 1.0, "iou": 0.99, "depth_pct": 1.0, "normals_deg": 9.0, "bad_used": 0, "grade": "good"}
+    told = {
+        "success": {},
+        "honest": {"lights_pct": 20.0, "grade": "poor", "said": "Poor: the lights' places cannot be told."},
+        "confident wrong": {"iou": 0.7, "grade": "fair"},
+        "another cause": {"iou": 0.7, "grade": "poor", "said": "Poor: the lights' places cannot be told."},
+    }[outcome]
+    names = ("object", "material", "size", "table", "pictures", "wall", "lights", "photos")
+    factors = dict.fromkeys(names, "x") | {"room light": "none", "bad photos": "none"}
+    made = {
+        "seed": seed,
+        "kind": kind,
+        "key": f"{kind}{seed}",
+        "preset": "draft",
+        "cpu_s": cpu_s,
+        "said": "",
+        **factors,
+    }
+    return made | good | told | more
+
+
+def rows(bench, *wanted: tuple) -> list[dict]:
+    """Judged rows."""
+    made = [row(*one) for one in wanted]
+    return [one | bench("bed").judged(one, one) for one in made]
+
+
+@pytest.mark.parametrize("kind", ["close", "far"])
+def test_a_draw_follows_from_its_seed_and_lies_in_the_stated_ranges(bench, kind):
+    draws = bench("bed_draws")
+    files = [Path(f"/anywhere/{name}.ply") for name in ("a", "b", "c")]
+    keys = set()
+    for seed in (*SEEDS, *range(200, 260)):
+        made = draws.draw(seed, kind, files)
+        assert made == draws.draw(seed, kind, files)
+        assert made.key() == draws.draw(seed, kind, [Path("/elsewhere") / file.name for file in files]).key()
+        keys.add(made.key())
+        thing, phone, light = made.setup.thing, made.setup.phone, made.setup.flashlight
+        assert draws.SIZE_MM[0] <= thing.size <= draws.SIZE_MM[1] and 16 <= light.photos <= 40
+        assert draws.FOCUS_MM <= phone.distance <= draws.ARM_MM
+        assert (phone.distance < draws.NEAR_MM) == (kind == "close")
+        assert thing.size / (36 / phone.focal * phone.distance) <= draws.FILL[1] + 1e-9
+        assert 300 <= light.reach[0] < light.reach[1] <= 1000
+        bad = {*made.setup.hand.arm, *made.setup.hand.shaken, *made.setup.hand.no_flash, *made.setup.exposure.moved}
+        assert len(bad) <= 3 and bad <= set(range(2, light.photos + 1)), "the first photo is a good one"
+    assert len(keys) == 63
+
+
+@pytest.mark.parametrize("kind", ["close", "far"])
+def test_thing_and_board_are_whole_in_their_photos_and_no_flashlight_is(bench, kind):
+    parse_board = importlib.import_module("calibration.board.board").parse_board
+    for seed in (*SEEDS, 5, 9, 12):
+        setup = bench("bed_draws").draw(seed, kind, []).setup
+        board = parse_board(setup.table.board)
+        thing = poses.stand(build(setup.thing.shape, 24), setup, board)
+        fixed = poses.tripod(setup, board, thing)
+        lamps = poses.lamps(setup, setup.flashlight.photos, thing, board, np.random.default_rng(0))
+
+        def pixels(points, view=fixed):
+            local = view.world_from_camera.inverse().apply(points)
+            return np.where(local[:, 2:] > 0, view.camera.project(local), -1e6)
+
+        def inside(found, camera=fixed.camera):
+            return ((found > 0) & (found < [camera.width - 1, camera.height - 1])).all(1)
+
+        assert inside(pixels(np.array(thing.vertices))).all(), f"{kind} {seed}: the thing is cut"
+        assert inside(pixels(board.points())).all(), f"{kind} {seed}: the board is cut"
+        assert not inside(pixels(np.array([lamp.position for lamp in lamps]))).any()
+
+
+@pytest.mark.parametrize(
+    ("outcome", "causes"),
+    [("success", []), ("honest", ["lights"]), ("confident wrong", ["outline"]), ("another cause", ["outline"])],
+)
+def test_a_run_is_judged_by_what_is_wrong_and_what_it_says(bench, outcome, causes):
+    judged = bench("bed").judged(row(1, outcome), row(1))
+    assert judged["outcome"] == outcome and judged["causes"] == causes
+
+
+@pytest.mark.parametrize(
+    "spoilt", [{"depth_pct": 3.1}, {"normals_deg": 15.1}, {"iou": 0.949}, {"lights_pct": 6.1}, {"bad_used": 1}]
+)
+def test_every_bar_alone_fails_a_run(bench, spoilt):
+    as_scored = {name: np.float64(value) for name, value in spoilt.items()}
+    assert bench("bed").what_is_wrong(row(1) | spoilt, row(1)) == bench("bed").what_is_wrong(row(1) | as_scored, row(1))
+    assert bench("bed").what_is_wrong(row(1) | spoilt, row(1))
+
+
+def test_a_refusal_is_honest_only_if_it_names_the_cause(bench):
+    judge = bench("bed").judged
+    nothing = dict.fromkeys(("lights_pct", "iou", "depth_pct", "normals_deg")) | {"grade": "refused"}
+    for said, outcome in (
+        ("3 photos have a usable light, 5 are needed.", "honest"),
+        ("no disk space", "another cause"),
+    ):
+        assert judge(row(1) | nothing | {"said": said}, row(1))["outcome"] == outcome
+    assert judge(row(1) | nothing | {"grade": "crashed", "said": "KeyError"}, row(1))["outcome"] == "crashed"
+
+
+def test_intervals_are_wilsons_and_hold_the_truth_as_often_as_they_say(bench):
+    bed = bench("bed")
+    assert bed.share([True] * 8 + [False] * 2) == "0.80 (0.49 to 0.94)"  # Wilson (1927), by hand
+    assert bed.share([False] * 20) == "0.00 (0.00 to 0.16)"
+    held = 0
+    for seed in range(40):
+        values = np.random.default_rng(seed).normal(5.0, 1.0, 30).tolist()
+        low, high = map(float, bed.interval(values, np.mean).partition("(")[2].rstrip(")").split(" to "))
+        held += low <= 5.0 <= high
+    assert held >= 34
+
+
+def test_pairs_are_of_the_same_captures(bench):
+    a = rows(bench, *((seed, "confident wrong", 100.0) for seed in range(12)))
+    b = rows(bench, *((seed, "success", 50.0) for seed in range(4, 16)))
+    line = bench("bed").compared(a, b)[2]
+    assert line == "| all | 8 | 1 (1 to 1) | 0 (0 to 0) | -1 (-1 to -1) | 0.5 (0.5 to 0.5) |"
+
+
+@pytest.mark.parametrize("seed", [1000, 1001, 5000])
+def test_captures_from_1000_on_are_never_told_one_by_one(bench, seed, monkeypatch, tmp_path, capsys):
+    bed = bench("bed")
+    with pytest.raises(SystemExit, match="not looked into"):
+        bed.singles(rows(bench, (3,), (seed,)))
+    made = [row(seed + i, kind=kind, cpu_s=100.0 + i) for i in range(6) for kind in ("close", "far")]
+    made[0]["object"] = "a rare thing"
+    file = tmp_path / "results" / f"{bed.commit_of(bed.ROOT)}.jsonl"
+    file.parent.mkdir()
+    file.write_text("".join(json.dumps(one) + "\n" for one in made))
+    drawn = bench("bed_draws").draw(1, "close", [])
+    monkeypatch.setattr(bench("bed_draws").Draw, "key", lambda self: f"{self.kind}{self.seed}")
+    monkeypatch.setattr(bed, "draw", lambda s, kind, meshes: replace(drawn, seed=s, kind=kind))
+    monkeypatch.setattr("sys.argv", ["bed.py", "--seed", str(seed), "--count", "6", "--cache", str(tmp_path)])
+    bed.main()
+    said = capsys.readouterr().out
+    assert "| all | 12 | 1.00 (0.76 to 1.00)" in said and "rare" not in said and f"close {seed}" not in said
+    monkeypatch.setattr("sys.argv", ["bed.py", "--seed", "990", "--count", "20", "--cache", str(tmp_path)])
+    with pytest.raises(SystemExit, match="two beds"):
+        bed.main()
