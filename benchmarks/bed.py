@@ -139,12 +139,12 @@ def what_is_wrong(row: Row, factors: dict[str, str]) -> list[str]:
     missing = {"lights_pct": np.inf, "iou": 0.0, "depth_pct": np.inf, "normals_deg": np.inf}
     value = {name: missing[name] if row.get(name) is None else row[name] for name in LIMITS}
     is_wrong = {k: bool(value[k] < limit if k == "iou" else value[k] > limit) for k, limit in LIMITS.items()}
-    causes = ["lights"] * is_wrong["lights_pct"] + ["outline"] * is_wrong["iou"]
-    causes += ["shape"] * (is_wrong["depth_pct"] or is_wrong["normals_deg"])
-    causes += ["bad photo"] * (row.get("bad_used", 0) > 0)
+    of_shape = is_wrong["depth_pct"] or is_wrong["normals_deg"]
+    told = {"lights": is_wrong["lights_pct"], "outline": is_wrong["iou"], "shape": of_shape}
+    causes = [cause for cause, is_so in (told | {"bad photo": row.get("bad_used", 0) > 0}).items() if is_so]
     if causes:
-        causes += ["moved camera"] * ("tapped" in factors["bad photos"])
-        causes += ["mixed light"] * (factors["room light"] == "strong")
+        there = {"moved camera": "tapped" in factors["bad photos"], "mixed light": factors["room light"] == "strong"}
+        causes += [cause for cause, is_so in there.items() if is_so]
     return causes
 
 
