@@ -294,7 +294,9 @@ def main() -> None:
         return
     commit = commit_of(options.tree)
     rows = results(options, options.tree.resolve(), commit)
-    kinds = [summary([row for row in rows if row["kind"] == kind], kind) for kind in options.kind]
+    if not rows:
+        raise SystemExit(f"none of these captures is kept for {commit}: run them without --kept.")
+    kinds = [summary([row for row in rows if row["kind"] == kind], kind) for kind in sorted({r["kind"] for r in rows})]
     is_unseen = last >= FIRST_UNSEEN
     parts = [table(HEAD, [*kinds, summary(rows, "all")]), by_factor(rows, FEWEST if is_unseen else 1)]
     page.write([f"Program: {commit}"], *parts, *([] if is_unseen else [singles(rows)]))
