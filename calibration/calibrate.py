@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -23,9 +24,9 @@ from calibration.outlines.metric_cues import MetricCues
 from calibration.posed_camera import PosedCamera
 from calibration.reframed import reframed, with_doubt
 from calibration.side_photos.side_views import metric_cues, side_notes
-from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError
 from capture.files.names import clip_of
+from capture.photos.finding import Finding, grouped
 from capture.photos.photo import PhotoStack, read_photo
 from capture.session.session import Session
 
@@ -85,7 +86,8 @@ def calibrate(
     )
     notes = [*session.notes, *residuals.get("notes", []), *framing_notes, *notes, *side_notes(sides)]
     wider = doubt.of_ground(posed_camera, residuals)
-    residuals = residuals | fit.residuals | wider | {"notes": notes, "side_photos": [side.row() for side in sides]}
+    rows = {"side_photos": [side.row() for side in sides], "left_out_photos": left_out_rows(session)}
+    residuals = residuals | fit.residuals | wider | {"notes": notes} | rows
     shared = {"beam": fit.beam, "ambient": fit.ambient, "residuals": residuals, "side_views": cues.views}
     return Calibration.of(posed_camera, every, **shared)
 
@@ -110,20 +112,24 @@ def with_camera_error(
     return tuple(found)
 
 
+def left_out_rows(session: Session) -> list[dict[str, Any]]:
+    """Return the photos that reading left out as a calibration's residuals have them: photo, role, reason."""
+    return [{"photo": x.photo.name, "role": x.role, "reason": f"{x.kind}: {x.text}"} for x in session.left_out]
+
+
 def left_out(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[dict[str, str], Bool[np.ndarray, " photos"]]:
     """Return the reasons why photos get no light, by name, and which photos of the stack are usable.
 
     Raises:
         CalibrationError: fewer than 4 are left; lists the faults of the others.
     """
-    dropped = {finding.photo.name: finding for finding in reversed(findings) if finding.drop}
+    dropped = {one.photo.name: one for one in reversed(findings) if one.drop and one.photo in stack.paths}
     usable = np.array([path.name not in dropped for path in stack.paths])
     if dropped and usable.sum() < MIN_PHOTOS:
-        kinds = ", ".join(f"{n} {kind}" for kind, n in Counter(one.kind for one in dropped.values()).most_common())
-        name = next(path.name for path in stack.paths if path.name in dropped)
+        faults = [one for one in findings if one.drop and one.role == "lit"]
         raise CalibrationError(
-            f"{usable.sum()} of {len(usable)} photos under the flashlight can be used, {MIN_PHOTOS} needed (25 or more "
-            f"are better); {kinds}. {name}: {dropped[name].text}. Take these photos again."
+            f"{usable.sum()} of {len({*stack.paths, *(one.photo for one in faults)})} photos under the flashlight can "
+            f"be used, {MIN_PHOTOS} needed (25 or more are better). {grouped(faults)}. Take these photos again."
         )
     return {name: f"{one.kind}: {one.text}" for name, one in dropped.items()}, usable
 

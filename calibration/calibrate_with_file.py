@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.board.board import parse_board
 from calibration.board.board_photos import fit_board
-from calibration.calibrate import calibrate, left_out, refuse_other_size
+from calibration.calibrate import calibrate, left_out, left_out_rows, refuse_other_size
 from calibration.calibration import Calibration
 from calibration.known_scene import KnownScene
 from calibration.light import Light
@@ -21,8 +21,8 @@ from calibration.lights.power import with_common_power, with_power_per_photo
 from calibration.posed_camera import PosedCamera
 from calibration.reframed import reframed
 from calibration.side_photos.side_views import metric_cues, side_notes
-from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError
+from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack, reduced
 from capture.session.session import Session
 
@@ -69,7 +69,8 @@ def calibrate_with_file(
     board = parse_board(residuals["board"])
     cues, sides = metric_cues(session, stack, usable, posed_camera, board, lens.on_sheet)
     notes += side_notes(sides)
-    residuals = residuals | {"notes": notes, "side_photos": [side.row() for side in sides]}
+    rows = {"side_photos": [side.row() for side in sides], "left_out_photos": left_out_rows(session)}
+    residuals = residuals | {"notes": notes} | rows
     shared = {"beam": given.beam, "ambient": ambient, "residuals": residuals, "side_views": cues.views}
     return Calibration.of(posed_camera, lights, **shared)
 

@@ -261,6 +261,10 @@ def _residuals(field: JsonField) -> dict[str, Any]:
         row["photo"].file_name()
         row["used"].flag()
         row.get("reason", "").text()
+    for row in field.get("left_out_photos", []).entries():
+        row["photo"].file_name()
+        for name in ("role", "reason"):
+            row[name].text()
     return found
 
 

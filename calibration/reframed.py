@@ -17,9 +17,9 @@ from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
-from capture.checks.finding import Finding
 from capture.checks.framing import NOT_COMPARED, NOT_SHOWN, REFRAMED, SEEN_FROM, ZOOM_STATED
 from capture.errors import CalibrationError
+from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
 
 GRID = 9  # points along each side of the picture

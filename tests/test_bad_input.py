@@ -74,12 +74,6 @@ def test_three_photos_only(capsys, tmp_path):
     assert "3 photos" in sentence and "4" in sentence
 
 
-def test_a_text_file_named_jpg(capsys, tmp_path):
-    capture = copy_photos(tmp_path / "capture")
-    (capture / "photos" / "IMG_0199.jpg").write_text("see you tomorrow\n" * 100)
-    assert "IMG_0199.jpg" in refusal(capsys, tmp_path, capture)
-
-
 def test_a_board_specification_that_is_not_one(capsys, tmp_path):
     sentence = refusal(capsys, tmp_path, copy_photos(tmp_path / "capture"), "--board", "chessboard:8x8")
     assert "chessboard:8x8" in sentence and "checkerboard:9x6:24.25" in sentence

@@ -105,7 +105,7 @@ def test_the_clip_that_a_phone_stores_beside_each_photo_is_no_capture(tmp_path, 
     rng = np.random.default_rng(3)
     for i, photo in enumerate(lit_table.lit_photos(5, rng, lit_table.table(rng))):
         save_photo(tmp_path / "photos" / f"IMG_{i}.jpg", photo)
-        save_photo(tmp_path / "board" / f"IMG_{i}.jpg", photo)
+        save_photo(tmp_path / "board" / f"IMG_{i}.jpg", photo[::-1])
     (tmp_path / "photos" / "IMG_3.MOV").symlink_to(filmed)
     assert not any(clip_of(path) for path in load_session(tmp_path).lit)
 

@@ -9,8 +9,8 @@ from PIL import Image
 
 import shadowgraph
 from calibration.calibration import load_calibration
-from capture.checks import first_look
 from capture.checks.first_look import FirstLook
+from capture.session import seen
 from reconstruct.check.coach import Coach, SeenLight, missing_sides, next_words, seen_lines
 
 SPOT = Path(__file__).parent.parent / "examples" / "spot"
@@ -43,12 +43,12 @@ def looked(tmp_path_factory):
         Image.fromarray(np.clip(pixels, 0, 255).astype(np.uint8)).save(folder / name, quality=95, exif=exif)
     (folder / "IMG_0204.jpg").write_bytes((SPOT / "photos" / "IMG_0129.jpg").read_bytes()[:3000])
     decoded = []
-    reader = first_look.read_small_photo
-    first_look.read_small_photo = lambda *given: decoded.append(given[0]) or reader(*given)
+    reader = seen.features_of
+    seen.features_of = lambda path: decoded.append(path) or reader(path)
     try:
         return first, look.look(), decoded
     finally:
-        first_look.read_small_photo = reader
+        seen.features_of = reader
 
 
 def test_roles_are_told_from_the_pictures(looked):
@@ -122,5 +122,6 @@ def test_watch_says_what_is_there_and_what_comes_next(tmp_path, capsys):
     (tmp_path / "broken.jpg").write_bytes(b"no photo")
     assert shadowgraph.main(["watch", str(tmp_path), "--once"]) == 0
     said = capsys.readouterr().out
-    assert "broken.jpg: TAKE IT AGAIN. unreadable" in said and "Next: photograph the board" in said
+    assert "broken.jpg: TAKE IT AGAIN. unreadable" in said
+    assert "IMG_0001.jpg: board" in said and "Next: room light off" in said
     assert shadowgraph.main(["watch", str(tmp_path / "nowhere")]) == 2

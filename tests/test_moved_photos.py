@@ -7,8 +7,8 @@ import lit_table
 import numpy as np
 import pytest
 
-from capture.checks.finding import keep_findings, kept_findings
 from capture.checks.moved_photos import check_and_register, register
+from capture.photos.finding import keep_findings, kept_findings
 from capture.photos.photo import PhotoStack
 
 N, FOCAL = 12, 250.0  # px; as of a lens of 27 mm

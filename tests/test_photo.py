@@ -30,7 +30,6 @@ from capture.photos.photo import (
     reduced,
     write_picture,
 )
-from capture.photos.store import PhotoRecord
 
 pillow_heif.register_heif_opener()
 FORMATS = {".jpg": "JPEG", ".png": "PNG", ".tif": "TIFF", ".heic": "HEIF", ".avif": "AVIF"}
@@ -256,7 +255,7 @@ def test_two_hundred_megapixels_take_less_than_two_gigabytes(tmp_path):
 
 
 def test_of_large_photos_fewer_are_read_at_a_time():
-    cores = [photo._readers(PhotoRecord(width, 3000, Exposure())) for width in (1000, 4000, 8000, 20000)]
+    cores = [photo.readers_at_once(3000 * width) for width in (1000, 4000, 8000, 20000)]
     assert cores == sorted(cores, reverse=True) and cores[-1] == 1 <= cores[0] <= photo.MAX_READERS
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from capture.checks.finding import Finding, keep_findings, kept_findings
 from capture.errors import CaptureError
 from capture.photos import photo
+from capture.photos.finding import Finding, keep_findings, kept_findings
 from capture.photos.photo import read_stack
 from capture.photos.store import CLIPPED, COLOURS, LIST
 

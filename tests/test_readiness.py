@@ -13,8 +13,8 @@ import reconstruct.source.source as calibration_source
 import shadowgraph
 from calibration.calibrated_views import CalibratedViews
 from capture.checks.board_alignment import BOARD_OFF
-from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError, ReconstructionError
+from capture.photos.finding import Finding
 from reconstruct.check import verdict as readiness
 from reconstruct.check.light_coverage import from_the_camera, shadow_cover, side_in_words
 from reconstruct.check.readiness import judge, refuse_hopeless

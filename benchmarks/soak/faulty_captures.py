@@ -30,8 +30,8 @@ from sheet import ROOT, Sheet, table
 from capture_faults import FAMILIES, MOVED, Case, Original, draw, original, save, smaller
 
 from calibration.light import Light
-from capture.checks.finding import Finding
 from capture.errors import UserError
+from capture.photos.finding import Finding
 from reconstruct.check.verdict import read_and_check
 from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos

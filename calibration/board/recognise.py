@@ -1,17 +1,19 @@
 """Recognise the board in the photos without a description, from marker numbers or from the grid of corners."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from calibration.board.board import Board, opencv_dictionary
-from calibration.board.corners import SEARCH_SIZES, Grey, find_board, reduced
+from calibration.board.board import Board, opencv_dictionary, parse_board
+from calibration.board.corners import SEARCH_SIZES, Grey, find_board, grey_of, reduced
 from calibration.board.lattice import find_lattices
 from calibration.board.placement import trimmed
+from capture.photos.photo import read_small_photo
 
 ASSUMED_SQUARE_MM = 30.0  # what fits five or six times across A4
 FAMILIES = (  # by increasing size: the small ones are the beginnings of the large ones
@@ -52,6 +54,25 @@ def guess_board(photos: Sequence[Grey]) -> BoardGuess | None:
     if board is None:
         return None
     return BoardGuess(board, f"No board was named; the photos show {board.spec()}, whose millimetres are assumed.")
+
+
+def board_finder(spec: str | None) -> Callable[[Path], bool]:
+    """Return a function that tells whether a photo shows this board, or a part of it; None: any printed one.
+
+    A blank sheet is never found so: any sheet of paper would be one.
+
+    Raises:
+        CalibrationError: there is no such board.
+    """
+    board = parse_board(spec) if spec else None
+
+    def shows_board(path: Path) -> bool:
+        grey = grey_of(read_small_photo(path, MARKER_SIZE))
+        if board is None:
+            return guess_board([grey]) is not None
+        return isinstance(board, Board) and find_board(grey, board, allow_part=True) is not None
+
+    return shows_board
 
 
 def is_mirrored(photos: Sequence[Grey]) -> bool:

@@ -7,8 +7,8 @@ from calibration.board.board_photos import fit_boards
 from calibration.calibrate import calibrate
 from calibration.calibrated_views import CalibratedView, CalibratedViews
 from calibration.views.agreement import agree
-from capture.checks.finding import Finding
 from capture.errors import CalibrationError, CaptureError
+from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
 from capture.session.capture import Capture
 from capture.session.session import Session

@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from capture.checks.finding import Finding
 from capture.checks.robust import spread
 from capture.photos.channels import mean_of_channels
+from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
 
 LONG_SIDE = 160  # px: shadows are larger than one of these

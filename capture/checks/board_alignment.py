@@ -22,9 +22,9 @@ from capture.checks.alignment import (
     allowed_px,
     textures_of,
 )
-from capture.checks.finding import Finding
 from capture.checks.picture_motion import Rotation, Shift
 from capture.checks.registration import Correlator, Plane, Points, moved_back, sigma_along
+from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
 
 BOARD_SHOWS = 0.1  # of the cells have to show the photos' texture: boards left 0.64 and more of it to see

@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float, Int
 from capture.checks.alignment import ANCHORS, FEWEST_PHOTOS, SHOWN, CommonView, allowed_px, densest
 from capture.checks.board_alignment import HomeView, board_findings, home_view
 from capture.checks.edge_sharpness import SMEARED, edge_sharpness
-from capture.checks.finding import Finding
 from capture.checks.registration import is_lit, middle_of, moved_back, texture_of
 from capture.checks.robust import column_spread
 from capture.photos.channels import mean_of_channels
+from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
 
 MOVED_SIGMAS = 5.0  # of the shift, and of how much the photos' shifts differ

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from capture.checks.alignment import FEWEST_PHOTOS
 from capture.checks.ambient_light import shadow_findings
 from capture.checks.camera_motion import view_findings
-from capture.checks.finding import Finding
 from capture.photos.channels import largest_channel, mean_of_channels
+from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
 from capture.photos.radiometry import WHITE_BALANCE
 

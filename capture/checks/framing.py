@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from capture.checks.finding import Finding
 from capture.checks.picture_motion import Homography
 from capture.checks.registration import BLACK
 from capture.photos.channels import mean_of_channels
+from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
 
 REFRAMED = "framed otherwise"  # kinds of finding: zoomed or turned, from the same place

@@ -16,10 +16,10 @@ import numpy as np
 from capture.checks.alignment import FEWEST_PHOTOS, REFERENCE_PX, allowed_px
 from capture.checks.board_alignment import BOARD_OFF, MOVED, HomeView, board_rotation, home_view
 from capture.checks.check_stack import check_stack
-from capture.checks.finding import Finding
 from capture.checks.framing import NOT_COMPARED, framing_findings
 from capture.checks.picture_motion import Angles, Homography, Rotation
 from capture.decode.exif import focal_in_pixels
+from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
 
 FARTHEST_PX = 12.0  # at REFERENCE_PX: a larger motion moves the camera's place as well

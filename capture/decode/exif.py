@@ -66,6 +66,7 @@ class PhotoHeader:
     camera: tuple[str, ...]  # maker, model, focal length, size in pixels: equal for photos of one phone and lens
     exposure: Exposure
     taken_s: float | None
+    size: tuple[int, int]  # width and height, px, as read_size gives them
 
 
 def read_header(path: Path) -> PhotoHeader:
@@ -75,9 +76,9 @@ def read_header(path: Path) -> PhotoHeader:
         CaptureError: not a photo, or larger than 200 megapixels.
     """
     exif = read_exif(path)
-    size = sorted(read_size(path))
-    camera = (str(exif.get(271, "")), str(exif.get(272, "")), str(tag_of(exif, 37386)), f"{size[1]} x {size[0]}")
-    return PhotoHeader(camera, exposure_of(exif), taken_of(exif))
+    size = read_size(path)
+    camera = (str(exif.get(271, "")), str(exif.get(272, "")), str(tag_of(exif, 37386)), f"{max(size)} x {min(size)}")
+    return PhotoHeader(camera, exposure_of(exif), taken_of(exif), size)
 
 
 def tag_of(exif: Image.Exif, tag: int) -> object:

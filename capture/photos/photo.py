@@ -180,7 +180,8 @@ def read_stack(
     missing = [index for index in range(len(paths)) if index not in store.taken]
     for index in missing[:1]:  # the first photo gives the size of all
         fill(index)
-    with ThreadPoolExecutor(_readers(store.taken.get(0))) as readers:
+    first = store.taken.get(0)
+    with ThreadPoolExecutor(readers_at_once(first.width * first.height if first else 1)) as readers:
         list(readers.map(fill, missing[1:]))
     stop_decoders()
     taken = [store.taken[index] for index in range(len(paths))]
@@ -195,9 +196,8 @@ def read_stack(
     return PhotoStack(rgbs, masks, tuple(paths), *size, gains, reference, None, focal, is_linear)
 
 
-def _readers(first: PhotoRecord | None) -> int:
-    """Return how many photos to read at a time: one per core, but fewer of large photos."""
-    pixels = first.width * first.height if first else 1
+def readers_at_once(pixels: int) -> int:
+    """Return how many photos of so many pixels to read at a time: one per core, but fewer of large photos."""
     return max(1, min(MAX_READERS, os.cpu_count() or 1, PIXELS_AT_ONCE // max(pixels, 1)))
 
 

@@ -20,6 +20,7 @@ from capture.errors import CaptureError
 from capture.files.names import natural_order, refuse_no_folder
 from capture.session.places import by_place
 from capture.session.roles import find_tripods
+from capture.session.seen import SeenPhotos
 from capture.session.session import (
     MOST_SIDE,
     ROLE_FOLDERS,
@@ -53,19 +54,23 @@ class Capture:
         return (*self.views, *(session for lie in self.lies for session in lie.sessions()))
 
 
-def load_capture(folder: Path) -> Capture:
+def load_capture(folder: Path, seen: SeenPhotos | None = None) -> Capture:
     """Read the capture in a folder.
 
-    A view that cannot be read is named in `left_out`, as long as another can be.
+    A view that cannot be read is named in `left_out`, as long as another can be; photos in that of their session.
+
+    Args:
+        seen: photos that were looked at before, and how a board is found in one.
 
     Raises:
         CaptureError: there is no such folder, no view can be read, or an error in session.toml.
     """
     refuse_no_folder(folder, "the folder that holds the photos")
+    seen = SeenPhotos() if seen is None else seen
     views, lies = folders_named(folder, VIEWS), folders_named(folder, LIES)
     if not views and not lies:
-        session = load_session(folder)
-        sessions, board = by_place(session)
+        session = load_session(folder, seen=seen)
+        sessions, board = by_place(session, seen)
         return Capture(folder, sessions, board, settings=session.settings)
     _refuse_unclear(folder, views, lies)
     settings = load_settings(folder)
@@ -74,8 +79,8 @@ def load_capture(folder: Path) -> Capture:
             f"{folder / 'session.toml'} names roles, and the photos are in {(views or lies)[0].name}/: roles are "
             f"needed there. Move them into {(views or lies)[0].name}/session.toml, names as in that folder."
         )
-    capture = _of_views(folder, views, settings, (), "")
-    capture = replace(capture, lies=tuple(_lie(one, settings, capture.board) for one in lies))
+    capture = _of_views(folder, views, settings, (), "", seen)
+    capture = replace(capture, lies=tuple(_lie(one, settings, capture.board, seen) for one in lies))
     _refuse_many(capture)
     return capture
 
@@ -109,13 +114,14 @@ def _refuse_many(capture: Capture) -> None:
         )
 
 
-def _lie(folder: Path, common: SessionSettings, board: Sequence[Path]) -> Capture:
+def _lie(folder: Path, common: SessionSettings, board: Sequence[Path], seen: SeenPhotos) -> Capture:
     """Return the capture of the object laid anew."""
-    return replace(_of_views(folder, folders_named(folder, VIEWS), common, board, folder.name), name=folder.name)
+    views = folders_named(folder, VIEWS)
+    return replace(_of_views(folder, views, common, board, folder.name, seen), name=folder.name)
 
 
 def _of_views(
-    folder: Path, views: Sequence[Path], common: SessionSettings, board: Sequence[Path], name: str
+    folder: Path, views: Sequence[Path], common: SessionSettings, board: Sequence[Path], name: str, seen: SeenPhotos
 ) -> Capture:
     """Return the capture of these views' folders; without any, the folder itself is a view.
 
@@ -131,11 +137,11 @@ def _of_views(
     left_out: list[tuple[str, str]] = []
     for called, view in zip(names, views or [folder], strict=True):
         try:
-            session = load_session(view, common)
+            session = load_session(view, common, seen)
         except CaptureError as error:
             left_out.append((called, str(error)))
             continue
-        sessions.append(replace(_with_board(session, shared), name=called))
+        sessions.append(replace(_with_board(session, shared, seen), name=called))
     if not sessions:
         raise CaptureError(left_out[0][1])
     back = phone_back(folder)
@@ -146,11 +152,11 @@ def _of_views(
     return Capture(folder, _with_side(sessions, side), rest, (), tuple(left_out), common)
 
 
-def _with_board(session: Session, shared: Sequence[Path]) -> Session:
+def _with_board(session: Session, shared: Sequence[Path], seen: SeenPhotos) -> Session:
     """Return a view without a photo of the board with that of the common ones that its tripod took, if there is one."""
     if session.board or not shared:
         return session
-    found = find_tripods(shared, session.lit)
+    found = find_tripods(seen.of(shared), seen.of(session.lit))
     return session if found is None else replace(session, board=(shared[found],))
 
 

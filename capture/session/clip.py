@@ -49,6 +49,10 @@ class ClipFrames:
     dark: tuple[Path, ...]
     note: str
 
+    def by_role(self) -> dict[str, tuple[Path, ...]]:
+        """Return the frames by the names of their roles."""
+        return {"board": self.board, "lit": self.lit, "dark": self.dark}
+
 
 @dataclass(frozen=True)
 class _Candidates:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from capture.decode.formats import is_photo_name
 from capture.files.names import is_clip_name, natural_order
-from capture.session.session import MASK, ROLE_FOLDERS
+from capture.session.sorting import MASK, ROLE_FOLDERS
 
 
 def photos_of(capture: Path) -> list[Path]:
@@ -15,6 +15,11 @@ def photos_of(capture: Path) -> list[Path]:
             mine = [path for path in place.iterdir() if is_photo_name(path) and path.name != MASK and path.is_file()]
             found += sorted(mine, key=natural_order)
     return found
+
+
+def folder_role(photo: Path, capture: Path) -> str:
+    """Return the role that a photo's folder gives it; "" for one in the capture itself."""
+    return next((role for role, name in ROLE_FOLDERS.items() if photo.parent == capture / name), "")
 
 
 def clips_of(capture: Path) -> list[Path]:

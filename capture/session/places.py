@@ -12,14 +12,16 @@ import cv2
 import numpy as np
 
 from capture.files.names import natural_order
-from capture.session.roles import DARK, EVEN, SAME_VIEW, PhotoFeatures, agreement, features_of, tiles_of
-from capture.session.session import FEWEST_LIT, ROLE_FOLDERS, Session
+from capture.session.roles import DARK, EVEN, SAME_VIEW, PhotoFeatures, agreement, tiles_of
+from capture.session.seen import SeenPhotos
+from capture.session.session import FEWEST_LIT, Session
+from capture.session.sorting import is_sorted
 
 PUSHED = 0.1  # of the picture's width: less is a pushed tripod, more shows other sides of the object
 VIEWS = "view_"
 
 
-def by_place(session: Session) -> tuple[tuple[Session, ...], tuple[Path, ...]]:
+def by_place(session: Session, seen: SeenPhotos) -> tuple[tuple[Session, ...], tuple[Path, ...]]:
     """Return a session for each place of the tripod, and photos of the board from elsewhere.
 
     The session itself, where there is one place, where the photos lie in folders, or where session.toml names roles.
@@ -27,19 +29,22 @@ def by_place(session: Session) -> tuple[tuple[Session, ...], tuple[Path, ...]]:
     Raises:
         CaptureError: a photo cannot be read.
     """
-    in_folders = any((session.folder / ROLE_FOLDERS[role]).is_dir() for role in ("lit", "board"))
-    if in_folders or session.settings.roles or len(session.lit) + len(session.board) < 2 * (FEWEST_LIT + 1):
+    if (
+        is_sorted(session.folder)
+        or session.settings.roles
+        or len(session.lit) + len(session.board) < 2 * (FEWEST_LIT + 1)
+    ):
         return (session,), ()
-    photos = [features_of(path) for path in (*session.board, *session.lit, *session.dark)]
+    photos = seen.of((*session.board, *session.lit, *session.dark))
     groups = [group for group in _groups(photos) if len(_lit(group)) >= FEWEST_LIT]
     if len(groups) < 2:
         return (session,), ()
     order = {photo.path: when for when, photo in enumerate(sorted(photos, key=_when))}
     groups.sort(key=lambda group: min(order[photo.path] for photo in group))
-    views = [_view(session, group, f"{VIEWS}{k + 1}") for k, group in enumerate(groups)]
+    views = [_view(session, group, f"{VIEWS}{k + 1}", seen) for k, group in enumerate(groups)]
     taken = {photo.path for group in groups for photo in group}
     said = f"the pictures show {len(views)} places of the tripod: {', '.join(f'{len(v.lit)} photos' for v in views)}"
-    views[0] = replace(views[0], notes=(*session.notes, said))
+    views[0] = replace(views[0], notes=(*session.notes, said), left_out=session.left_out)
     return tuple(views), tuple(path for path in session.board if path not in taken)
 
 
@@ -85,17 +90,14 @@ def _lit(group: Sequence[PhotoFeatures]) -> list[PhotoFeatures]:
     return [photo for photo in group if photo.evenness < EVEN and photo.level >= DARK * level]
 
 
-def _view(session: Session, group: Sequence[PhotoFeatures], name: str) -> Session:
+def _view(session: Session, group: Sequence[PhotoFeatures], name: str, seen: SeenPhotos) -> Session:
     """Return the session of one place."""
     lit = {photo.path for photo in _lit(group)}
     even = sorted((photo for photo in group if photo.evenness >= EVEN), key=lambda photo: -photo.evenness)
     board = tuple(photo.path for photo in even if photo.path not in session.dark)
     dark = tuple(photo.path for photo in group if photo.path not in lit and photo.path not in board)
     times = [photo.header.taken_s for photo in group if photo.header.taken_s is not None]
-    light = tuple(path for path in session.light if times and min(times) <= _taken(path) <= max(times))
-    in_order = tuple(sorted(lit, key=natural_order))
-    return replace(session, board=board, lit=in_order, light=light, dark=dark, notes=(), mask=None, name=name)
-
-
-def _taken(path: Path) -> float:
-    return features_of(path).header.taken_s or float("-inf")
+    light = [one for one in seen.of(session.light) if times and min(times) <= _when(one)[0] <= max(times)]
+    in_order, carried = tuple(sorted(lit, key=natural_order)), tuple(one.path for one in light)
+    found = {"board": board, "lit": in_order, "light": carried, "dark": dark}
+    return replace(session, **found, notes=(), mask=None, name=name, left_out=())

@@ -6,7 +6,7 @@ correlated by at least 0.98 within one view, and by at most 0.46 between two.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +29,8 @@ BLACK = 0.004  # added to linear brightness before the logarithm: about one step
 FINE_PX = 1.0  # scale of the texture that is compared
 NOISE = 0.02  # contrast of texture below which it is noise
 CELL_PX = 16  # cells for brightness, larger than the grain and smaller than a shadow
+SMALL_PX = 10  # each way of the picture that copies are told by: what saving a photo again changes averages out in it
+FEWEST_CARRIED = 4  # photos by the flashlight's phone: fewer do not tell where the light is (calibration/flashlight)
 
 
 class NoBoardError(CaptureError):
@@ -57,51 +59,33 @@ class PhotoFeatures:
     level: float  # median linear brightness, exposure divided out
     evenness: float  # 5th percentile over median of the brightness of cells
     header: PhotoHeader
+    size: tuple[int, int]  # width and height of the stored pixels, px
+    small: Float[np.ndarray, "SMALL_PX SMALL_PX 3"]  # the picture, 0..255 in sRGB
 
 
-def find_tripod_first(board: Sequence[Path], lit: Sequence[Path]) -> tuple[Path, ...]:
-    """Return the board photos with one that shares the lit photos' view first; unchanged if none can be identified.
-
-    Raises:
-        CaptureError: a photo cannot be read.
-    """
-    if len(board) < 2:
-        return tuple(board)
-    best = find_tripods(board, lit)
-    return (board[best or 0], *board[: best or 0], *board[(best or 0) + 1 :])
-
-
-def find_tripods(board: Sequence[Path], lit: Sequence[Path]) -> int | None:
-    """Return which of the board photos best shares the lit photos' view; None if none can be identified.
-
-    Raises:
-        CaptureError: a photo cannot be read.
-    """
-    some = [features_of(path) for path in lit[:: max(1, len(lit) // 6)]]
-    shared = [float(np.median([agreement(features_of(path), other) for other in some])) for path in board]
+def find_tripods(board: Sequence[PhotoFeatures], lit: Sequence[PhotoFeatures]) -> int | None:
+    """Return which of the board photos best shares the lit photos' view; None if none can be identified."""
+    some = lit[:: max(1, len(lit) // 6)]
+    shared = [float(np.median([agreement(photo, other) for other in some])) for photo in board]
     return int(np.argmax(shared)) if shared and max(shared) >= SAME_VIEW else None
 
 
-def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
+def roles_of(
+    photos: Sequence[PhotoFeatures],
+    is_board_known: bool = False,
+    shows_board: Callable[[Path], bool] = lambda _: False,
+) -> Roles:
     """Find the roles of the photos of one flat folder.
 
     1. The largest set of photos with one view and one camera is from the tripod. 2. Same camera, far darker: dark.
-    3. Tripod, even light, thus room light: board; all other tripod photos: lit. 4. Same camera, other view: board; but
-    if taken between the lit photos, from the flashlight's phone (if there are many) or a faulty lit photo. 5. Other
-    camera: from the flashlight's phone.
+    3. Tripod, even light, thus room light: board; all other tripod photos: lit. 4. Photos by another camera, or of
+    another view taken between the lit ones: from the flashlight's phone, if there are enough for it. 5. Of the rest,
+    those in which a board is found or that room light lit: board; the others are faulty lit photos.
 
     Args:
-        paths: in the order in which they were taken, as far as their names show it.
+        photos: in the order in which they were taken, as far as their names show it.
         is_board_known: the tripod's photo of the board is not among them.
-
-    Raises:
-        CaptureError: a photo cannot be read, no two show the same view, or no tripod photo was taken in room light.
-    """
-    return roles_of([features_of(path) for path in paths], is_board_known)
-
-
-def roles_of(photos: Sequence[PhotoFeatures], is_board_known: bool = False) -> Roles:
-    """Do what `find_roles` does with photos whose features are known.
+        shows_board: whether a board is found in a photo.
 
     Raises:
         CaptureError: no two show the same view, or no tripod photo was taken in room light.
@@ -118,16 +102,39 @@ def roles_of(photos: Sequence[PhotoFeatures], is_board_known: bool = False) -> R
     fixed = [photo for photo in fixed if photo not in dark]
     board = [] if is_board_known else _room_lit(fixed, len(photos))
     lit = [photo for photo in fixed if photo not in board]
-    others = [photo for photo in photos if photo.header.camera == camera and photo not in fixed and photo not in dark]
-    during = _taken_between(others, lit, photos)
-    light = [photo for photo in photos if photo.header.camera != camera]
-    if len(during) > len(lit) // 2:
-        light += during
-    else:
-        lit += during
-    board += [photo for photo in others if photo not in during]
+    others = [photo for photo in photos if photo not in fixed and photo not in dark]
+    light = _carried(others, lit, photos, shows_board)
+    rest = [photo for photo in others if photo not in light]
+    for photo in rest:
+        is_first = photo.header.camera == camera and photo.evenness >= EVEN and not _taken_between([photo], lit, photos)
+        is_series = sum(agreement(photo, other) >= SAME_VIEW for other in rest) > FEWEST_CARRIED  # of a tripod
+        (board if is_first or (not is_series and shows_board(photo.path)) else lit).append(photo)
     lit, light, dark = ([photo for photo in photos if photo in group] for group in (lit, light, dark))
     return Roles(*(tuple(photo.path for photo in group) for group in (board, lit, light, dark)))
+
+
+def _carried(
+    others: Sequence[PhotoFeatures],
+    lit: Sequence[PhotoFeatures],
+    photos: Sequence[PhotoFeatures],
+    shows_board: Callable[[Path], bool],
+) -> list[PhotoFeatures]:
+    """Return the photos by the phone that carries the flashlight; it takes one with each lit photo.
+
+    They are those by another camera, if there are enough, but for photos of the board where most were taken before or
+    after the lit ones; and those of another view, if more than half as many as the lit ones were taken between these.
+    """
+    during = _taken_between(others, lit, photos)
+    own = [photo for photo in others if lit and photo.header.camera == lit[0].header.camera]
+    light: list[PhotoFeatures] = []
+    for camera in dict.fromkeys(photo.header.camera for photo in others if photo not in own):
+        group = [photo for photo in others if photo.header.camera == camera]
+        is_timed = all(photo.header.taken_s is not None for photo in (*group, *lit))
+        is_apart = is_timed and sum(photo in during for photo in group) <= len(group) // 2
+        if len(group) >= FEWEST_CARRIED:
+            light += [photo for photo in group if not is_apart or not shows_board(photo.path)]
+    between = [photo for photo in own if photo in during]
+    return light + (between if len(between) > len(lit) // 2 else [])
 
 
 def features_of(path: Path) -> PhotoFeatures:
@@ -149,7 +156,10 @@ def features_of(path: Path) -> PhotoFeatures:
     gain = header.exposure.relative() or 1.0
     texture = _texture(brightness)
     level = float(np.median(cells)) / gain
-    return PhotoFeatures(path, brightness.shape, texture, tiles_of(texture), level, evenness(cells), header)
+    size = header.size if (width > height) == (header.size[0] > header.size[1]) else header.size[::-1]
+    small = cv2.resize(thumbnail, (SMALL_PX, SMALL_PX), interpolation=cv2.INTER_AREA).astype(np.float32)
+    shown = (brightness.shape, texture, tiles_of(texture), level, evenness(cells))
+    return PhotoFeatures(path, *shown, header, size, small)
 
 
 def cells_of(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, " cells"]:
@@ -186,7 +196,7 @@ def tiles_of(texture: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "t
 
 def agreement(one: PhotoFeatures, other: PhotoFeatures) -> float:
     """Return the correlation of the best tiles: near 1 for one view, near 0 for two."""
-    if one.tiles.shape != other.tiles.shape or one.shape != other.shape:
+    if one.size != other.size or one.shape != other.shape:
         return 0.0
     return float(np.percentile((one.tiles * other.tiles).sum(1), BEST_TILES))
 

@@ -1,17 +1,18 @@
 """Read a folder of photos as a session: session.toml and the role of every photo."""
 
-import filecmp
 import re
 import sys
 import tomllib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from capture.decode.formats import format_of, is_photo_name
+from capture.decode.formats import is_photo_name
 from capture.errors import CaptureError
-from capture.files.names import clip_of, is_clip_name, natural_order, refuse_no_folder, stored_file
+from capture.files.names import is_clip_name, natural_order, refuse_no_folder, stored_file
 from capture.files.regular import why
+from capture.photos.finding import Finding, grouped
 from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
 from capture.session.declared_objects import (
     DeclaredObjects,
@@ -23,17 +24,28 @@ from capture.session.declared_objects import (
     parse_phone_back,
     parse_thickness,
 )
-from capture.session.roles import NoBoardError, Roles, find_roles, find_tripod_first
+from capture.session.roles import NoBoardError, Roles
+from capture.session.seen import SeenPhotos
 from capture.session.skipped import naming_skipped
+from capture.session.sorting import (
+    FEWEST_LIT,
+    MASK,
+    PHONE_BACK,
+    ROLE_FOLDERS,
+    SoundPhotos,
+    is_beside,
+    is_sorted,
+    photos_in,
+    sorted_roles,
+    sound_photos,
+    stored_photos,
+    tripod_first,
+)
 
-FEWEST_LIT = 4  # below this, shadows leave most of the shape open
 ADVISED_LIT = 12
 MOST_SIDE = 8  # photos from the side: more add little, and each is read whole
-ROLE_FOLDERS = {"board": "board", "lit": "photos", "light": "light", "dark": "dark", "side": "side"}
 SETTINGS_FILE = "session.toml"
 NEVER_READ = "gt"  # ground truth of simulated captures
-MASK = "mask.png"  # beside session.toml: white on the object, pixels of the photos
-PHONE_BACK = "phone_back"  # stem of a photo beside session.toml: the flashlight phone's back, its LED lit
 CLIP_FRAMES = 40  # chosen from a clip: further ones lie between these
 MOST_CLIP_FRAMES = 300
 SETTINGS = (
@@ -85,9 +97,10 @@ class Session:
     phone_back: Path | None = None  # photo of the back of the flashlight's phone
     side: tuple[Path, ...] = ()  # handheld photos of object and board in room light
     name: str = ""  # of the view, in a capture of several
+    left_out: tuple[Finding, ...] = ()  # photos that cannot be read, are copies, or have another size than the rest
 
 
-def load_session(folder: Path, common: SessionSettings | None = None) -> Session:
+def load_session(folder: Path, common: SessionSettings | None = None, seen: SeenPhotos | None = None) -> Session:
     """Read the session in a folder: `board/ photos/ [light/] [dark/] [side/]`, or all photos in one flat folder.
 
     Photos are in the natural order of their names (IMG_9 before IMG_10). A clip may replace the photos, those of the
@@ -96,10 +109,10 @@ def load_session(folder: Path, common: SessionSettings | None = None) -> Session
     Args:
         common: the settings of a capture of several views, for what the folder's own session.toml does not say. The
             folder is then one view, which may lack photos of the board.
+        seen: photos that were looked at before.
 
     Raises:
-        CaptureError: there is no such folder, photos or board, too few lit photos, a file that is no photo, or an error
-            in session.toml.
+        CaptureError: there is no such folder, photos or board, too few lit photos of use, or an error in session.toml.
     """
     refuse_no_folder(folder, "the folder that holds the photos")
     settings = load_settings(folder)
@@ -108,21 +121,19 @@ def load_session(folder: Path, common: SessionSettings | None = None) -> Session
         settings = replace(settings, board=settings.board or common.board)
         if settings.board_thickness_mm is None:
             settings = replace(settings, board_thickness_mm=common.board_thickness_mm)
-    sorted_already = (folder / ROLE_FOLDERS["lit"]).is_dir() or (folder / ROLE_FOLDERS["board"]).is_dir()
+    seen = SeenPhotos() if seen is None else seen
     with naming_skipped(folder, ROLE_FOLDERS.values()) as skipped:
-        read = _roles_of_folders if sorted_already else _roles_of_flat_folder
-        roles, notes = read(folder, settings)
-        roles, notes = _overruled(roles, folder, settings), notes + skipped
-        _refuse_too_few(roles, folder, needs_board=common is None)
-    _refuse_copies(roles.lit)
-    if sorted_already and not any(role == "board" for role, _ in settings.roles):
-        roles = replace(roles, board=find_tripod_first(roles.board, roles.lit))
+        roles, left_out, notes = _roles(folder, settings, seen, needs_board=common is None)
+    notes += skipped
+    if is_sorted(folder) and not any(role == "board" for role, _ in settings.roles):
+        roles = replace(roles, board=tripod_first(roles.board, roles.lit, seen))
     mask = folder / MASK
     given = mask if mask.is_file() else None
     photos = (roles.board, roles.lit, roles.light, roles.dark)
     if len(roles.side) > MOST_SIDE:
         notes += (f"{len(roles.side) - MOST_SIDE} photos from the side were left out: the first {MOST_SIDE} are used",)
-    return Session(folder, *photos, settings, notes, given, phone_back(folder), roles.side[:MOST_SIDE])
+    more = {"side": roles.side[:MOST_SIDE], "left_out": left_out}
+    return Session(folder, *photos, settings, notes, given, phone_back(folder), **more)
 
 
 def load_settings(folder: Path) -> SessionSettings:
@@ -216,35 +227,14 @@ def _role_names(value: Any, path: Path) -> tuple[tuple[str, tuple[str, ...]], ..
     return tuple((role, tuple(names)) for role, names in value.items())
 
 
-def photos_in(folder: Path) -> list[Path]:
-    """Return the folder's photos in natural order; of a RAW file and the JPEG or HEIC of the same name, the RAW file.
-
-    Raises:
-        CaptureError: a file has a photo's name but other content.
-    """
-    if not folder.is_dir():
-        return []
-    paths = sorted(
-        (p for p in folder.iterdir() if p.is_file() and is_photo_name(p) and not _is_beside(p)), key=natural_order
-    )
-    formats = {path: format_of(path) for path in paths}
-    raw_stems = {path.stem for path in paths if formats[path] == "raw"}
-    return [path for path in paths if formats[path] == "raw" or path.stem not in raw_stems]
-
-
 def board_photos(folder: Path) -> tuple[Path, ...]:
     """Return the photos of the board in a folder, or frames of its clips.
 
     Raises:
-        CaptureError: a file has a photo's name but other content, or a clip cannot be read.
+        CaptureError: a clip cannot be read.
     """
     photos = tuple(photos_in(folder))
-    return photos or tuple(frame for clip in _clips_in(folder) for frame in choose_board_frames(clip))
-
-
-def _is_beside(path: Path) -> bool:
-    """Return whether a picture in a capture's folder is not one of its photos."""
-    return path.name == MASK or path.stem == PHONE_BACK
+    return photos or tuple(frame for clip in clips_in(folder) for frame in choose_board_frames(clip))
 
 
 def phone_back(folder: Path) -> Path | None:
@@ -259,7 +249,7 @@ def phone_back(folder: Path) -> Path | None:
     return found[0] if found else None
 
 
-def _clips_in(folder: Path) -> list[Path]:
+def clips_in(folder: Path) -> list[Path]:
     """Return the folder's clips in natural order, without the short ones that phones store beside a photo."""
     if not folder.is_dir():
         return []
@@ -268,10 +258,54 @@ def _clips_in(folder: Path) -> list[Path]:
     return sorted((path for path in files if is_clip_name(path) and path.stem not in stills), key=natural_order)
 
 
-def _roles_of_folders(folder: Path, settings: SessionSettings) -> tuple[Roles, tuple[str, ...]]:
-    found = {role: tuple(photos_in(folder / name)) for role, name in ROLE_FOLDERS.items()}
-    beside = {role: _clips_in(folder / name) for role, name in ROLE_FOLDERS.items()}
-    clips = {role: beside[role] for role in beside if not found[role]}
+def named_photos(folder: Path, settings: SessionSettings) -> dict[str, list[Path]]:
+    """Return the photos that session.toml names, by their roles.
+
+    Raises:
+        CaptureError: one of them is not in the capture.
+    """
+    return {role: [_named(folder, name) for name in names] for role, names in settings.roles}
+
+
+def _roles(
+    folder: Path, settings: SessionSettings, seen: SeenPhotos, needs_board: bool
+) -> tuple[Roles, tuple[Finding, ...], tuple[str, ...]]:
+    """Return the roles of photos and frames of clips, the photos that are left out, and notes on the clips.
+
+    Of a flat folder, clips are used only if the photos alone are no capture; the photos then show the board.
+    """
+    named = named_photos(folder, settings)
+    sound = sound_photos(stored_photos(folder), named, seen)
+    clips = [] if is_sorted(folder) else clips_in(folder)
+    try:
+        _refuse_few_loose(sound, folder)
+        roles, left_out = sorted_roles(sound, seen)
+        if clips and len(roles.lit) < FEWEST_LIT:
+            raise CaptureError("the clips are needed")
+        notes = tuple(f"{clip.name} was left out: the photos beside it are a capture" for clip in clips)
+    except CaptureError as error:
+        if not clips:
+            raise _with_faults(error, sound.left_out) from None
+        left_out, loose, stills = (
+            sound.left_out,
+            tuple(sound.by_role[""]),
+            replace(sound, by_role=sound.by_role | {"": []}),
+        )
+        roles, notes = sorted_roles(stills, seen)[0], ()
+        for clip in clips:
+            frames = choose_frames(clip, settings.clip_frames)
+            roles, notes = _with_frames(roles, frames.by_role(), settings), (*notes, frames.note)
+        roles = replace(roles, board=(*roles.board, *loose))
+    if is_sorted(folder):
+        roles, notes = _with_clips(roles, folder, settings)
+    _refuse_too_few(roles, folder, needs_board, left_out)
+    return roles, left_out, notes
+
+
+def _with_clips(roles: Roles, folder: Path, settings: SessionSettings) -> tuple[Roles, tuple[str, ...]]:
+    """Return the roles with frames of the clips that lie in a role's folder in place of photos."""
+    beside = {role: clips_in(folder / name) for role, name in ROLE_FOLDERS.items()}
+    clips = {role: beside[role] for role in beside if not getattr(roles, role)}
     if clips.get("light"):
         raise CaptureError(
             f"{clips['light'][0]} is a clip; photos by the flashlight's phone, one for each in photos/, are needed. "
@@ -282,66 +316,22 @@ def _roles_of_folders(folder: Path, settings: SessionSettings) -> tuple[Roles, t
     notes += tuple(f"side/{clip.name} was left out: photos are needed there, no clip" for clip in clips.get("side", ()))
     for clip in clips.get("lit", ()):
         frames = choose_frames(clip, settings.clip_frames)
-        found["lit"] += frames.lit
-        found["board"] = (*frames.board, *found["board"])
-        found["dark"] += frames.dark if not clips.get("dark") else ()
-        notes += (frames.note,)
+        filmed = frames.by_role() | ({"dark": ()} if clips.get("dark") else {})
+        roles, notes = _with_frames(roles, filmed, settings), (*notes, frames.note)
     for clip in clips.get("board", ()):
-        found["board"] += choose_board_frames(clip)
+        roles = replace(roles, board=(*roles.board, *choose_board_frames(clip)))
     for clip in clips.get("dark", ()):
-        found["dark"] += choose_any_frames(clip)
-    return Roles(**found), notes
+        roles = replace(roles, dark=(*roles.dark, *choose_any_frames(clip)))
+    return roles, notes
 
 
-def _roles_of_flat_folder(folder: Path, settings: SessionSettings) -> tuple[Roles, tuple[str, ...]]:
-    """Use clips only if the photos alone are no capture; the photos then show the board."""
-    clips = _clips_in(folder)
-    if clips:
-        try:
-            roles = _roles_of_flat_photos(folder, settings)
-        except CaptureError:
-            roles = Roles((), (), (), ())
-        if len(roles.lit) < FEWEST_LIT:
-            return _roles_with_clips(folder, clips, settings)
-        return roles, tuple(f"{clip.name} was left out: the photos beside it are a capture" for clip in clips)
-    return _roles_of_flat_photos(folder, settings), ()
-
-
-def _roles_with_clips(folder: Path, clips: list[Path], settings: SessionSettings) -> tuple[Roles, tuple[str, ...]]:
-    chosen = [choose_frames(clip, settings.clip_frames) for clip in clips]
-    lit, board, dark = (
-        tuple(path for frames in chosen for path in getattr(frames, role)) for role in ("lit", "board", "dark")
-    )
-    return Roles((*board, *photos_in(folder)), lit, (), dark), tuple(frames.note for frames in chosen)
-
-
-def _roles_of_flat_photos(folder: Path, settings: SessionSettings) -> Roles:
-    paths = photos_in(folder)
-    if not paths:
-        raise CaptureError(
-            f"no photos found in {folder}. Put the photos there, or into its folders board/ and photos/ "
-            "(JPEG, PNG, TIFF, HEIC, AVIF, EXR or RAW), or a clip of the moving flashlight (MP4, MOV, MKV or WebM)."
-        )
-    if len(paths) <= FEWEST_LIT:
-        raise CaptureError(
-            f"{len(paths)} photos found in {folder}, at least {FEWEST_LIT + 1} are needed: the board in room light, "
-            f"and {FEWEST_LIT} lit by the flashlight ({ADVISED_LIT} or more advised). Take more photos."
-        )
-    named = {role: {folder / name for name in names} for role, names in settings.roles}
-    paths = [path for path in paths if not any(path in group for group in named.values())]
-    roles = find_roles(paths, is_board_known=bool(named.get("board"))) if paths else Roles((), (), (), ())
-    return replace(roles, side=tuple(photos_in(folder / ROLE_FOLDERS["side"])))
-
-
-def _overruled(roles: Roles, folder: Path, settings: SessionSettings) -> Roles:
-    """Return the roles with the files that session.toml names moved to its roles."""
-    found = {role: list(getattr(roles, role)) for role in ROLE_FOLDERS}
-    for role, names in settings.roles:
-        named = [_named(folder, name) for name in names]
-        for other in found:
-            found[other] = [path for path in found[other] if path not in named]
-        found[role] = named + found[role] if role == "board" else sorted(named + found[role], key=natural_order)
-    return Roles(**{role: tuple(paths) for role, paths in found.items()})
+def _with_frames(roles: Roles, filmed: Mapping[str, Sequence[Path]], settings: SessionSettings) -> Roles:
+    """Return the roles with frames of a clip, but for frames that session.toml names: they have their role."""
+    known = {path for role in ROLE_FOLDERS for path in getattr(roles, role)}
+    fresh = {role: tuple(path for path in paths if path not in known) for role, paths in filmed.items()}
+    is_named = any(role == "board" for role, _ in settings.roles)
+    board = (*roles.board, *fresh["board"]) if is_named else (*fresh["board"], *roles.board)
+    return replace(roles, board=board, lit=(*roles.lit, *fresh["lit"]), dark=(*roles.dark, *fresh["dark"]))
 
 
 def _named(folder: Path, name: str) -> Path:
@@ -349,23 +339,42 @@ def _named(folder: Path, name: str) -> Path:
     inside = not Path(name).is_absolute() and ".." not in Path(name).parts and NEVER_READ not in Path(name).parts
     if not inside or not stored_file(path).is_file():
         raise CaptureError(f"{folder / SETTINGS_FILE} names {name}, which is not in {folder}. Correct the name.")
-    format_of(path)
     return path
 
 
-def _refuse_too_few(roles: Roles, folder: Path, needs_board: bool) -> None:
-    if not roles.lit and not roles.board:
+def _with_faults(error: CaptureError, left_out: Sequence[Finding]) -> CaptureError:
+    """Return the error with what is wrong with the photos that were left out, all at once."""
+    return type(error)(f"{error} Left out: {grouped(left_out)}.") if left_out else error
+
+
+def _refuse_few_loose(sound: SoundPhotos, folder: Path) -> None:
+    """Refuse a flat folder with fewer photos than a capture has."""
+    count = sum(map(len, sound.by_role.values())) - len(sound.by_role["side"])
+    if is_sorted(folder) or count > FEWEST_LIT:
+        return
+    if not count and not sound.left_out:
+        raise CaptureError(
+            f"no photos found in {folder}. Put the photos there, or into its folders board/ and photos/ "
+            "(JPEG, PNG, TIFF, HEIC, AVIF, EXR or RAW), or a clip of the moving flashlight (MP4, MOV, MKV or WebM)."
+        )
+    raise CaptureError(
+        f"{count} photos found in {folder}, at least {FEWEST_LIT + 1} are needed: the board in room light, "
+        f"and {FEWEST_LIT} lit by the flashlight ({ADVISED_LIT} or more advised). Take more photos."
+    )
+
+
+def _refuse_too_few(roles: Roles, folder: Path, needs_board: bool, left_out: Sequence[Finding]) -> None:
+    advice = f"Left out: {grouped(left_out)}. Take these again." if left_out else ""
+    if not roles.lit and not roles.board and not left_out:
         raise CaptureError(f"no photos found in {folder}. Put them into its folders board/ and photos/.")
     if len(roles.lit) < FEWEST_LIT:
         raise CaptureError(
             f"{len(roles.lit)} photos lit by the flashlight found in {folder}, {FEWEST_LIT} needed at least, "
-            f"{ADVISED_LIT} or more advised. {_unread(folder) or _MORE_LIGHTS}"
+            f"{ADVISED_LIT} or more advised. {advice or _unread(folder) or _MORE_LIGHTS}"
         )
     if needs_board and not roles.board:
-        raise NoBoardError(
-            f"no photo of the board found in {folder}, one from the tripod's place is needed. "
-            f"{_unread(folder) or 'Photograph the board in room light and put the photo into board/.'}"
-        )
+        how = advice or _unread(folder) or "Photograph the board in room light and put the photo into board/."
+        raise NoBoardError(f"no photo of the board found in {folder}, one from the tripod's place is needed. {how}")
 
 
 _MORE_LIGHTS = "Take more photos with the flashlight at other places."
@@ -376,24 +385,9 @@ def _unread(folder: Path) -> str:
 
     Beside board/ or photos/ the folder itself is not read, and a clip is not read beside photos.
     """
-    files = [path for path in folder.iterdir() if path.is_file() and not _is_beside(path)]
+    files = [path for path in folder.iterdir() if path.is_file() and not is_beside(path)]
     loose = [path for path in files if is_photo_name(path) or is_clip_name(path)]
     if loose and any((folder / name).is_dir() for name in (ROLE_FOLDERS["board"], ROLE_FOLDERS["lit"])):
         return f"{len(loose)} photos or clips are beside its folders ({loose[0].name}, ...): move them into these."
-    clips = _clips_in(folder / ROLE_FOLDERS["lit"])
+    clips = clips_in(folder / ROLE_FOLDERS["lit"])
     return f"The clip photos/{clips[0].name} is not read beside photos: remove the clip or the photos." if clips else ""
-
-
-def _refuse_copies(lit: tuple[Path, ...]) -> None:
-    """Refuse copies of a photo: each would count as a separate light but adds no information."""
-    seen: dict[int, list[Path]] = {}
-    for path in lit:
-        if clip_of(path):
-            continue
-        alike = seen.setdefault(path.stat().st_size, [])
-        for other in alike:
-            if filecmp.cmp(path, other, shallow=False):
-                raise CaptureError(
-                    f"{path} and {other.name} are the same photo, each was needed once. Remove one of them."
-                )
-        alike.append(path)

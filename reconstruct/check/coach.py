@@ -10,13 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from calibration.board.board_photos import fit_board
+from calibration.board.recognise import board_finder
 from calibration.flashlight.fit import collect, first_guess, fit_flashlights
 from calibration.flashlight.model import Evidence, free_tangent
 from calibration.posed_camera import PosedCamera
 from capture.checks.first_look import FirstLook, PhotoLook, companions
-from capture.errors import CalibrationError, CaptureError
-from capture.session.roles import find_tripod_first
+from capture.errors import CalibrationError, CaptureError, UserError
+from capture.session.seen import SeenPhotos
 from capture.session.session import ADVISED_LIT, Session, load_settings
+from capture.session.sorting import tripod_first
 from reconstruct.check.light_coverage import SIDES, azimuth_from_camera
 
 LOW = 60.0  # degrees: a light higher than that says little about the sides
@@ -55,13 +57,14 @@ class Coach:
     _known_camera: PosedCamera | None = None  # that they were found with
 
     def __post_init__(self):
-        self._first = FirstLook(self.folder)
+        self._first = FirstLook(self.folder, SeenPhotos(self._shows_board))
 
     def look(self) -> Coached:
         """Look at what is there. Nothing here fails because of what the photos show."""
         photos = self._first.look()
-        lit = [one.name for one in photos if one.role == "lit" and not one.drop]
-        board = [one.name for one in photos if one.role == "board" and not one.drop]
+        last = max((one.place for one in photos), default=0)  # of the tripod: where it stands now
+        lit = [one.name for one in photos if one.role == "lit" and one.place == last and not one.drop]
+        board = [one.name for one in photos if one.role == "board" and one.place == last and not one.drop]
         if not board or len(lit) < 4:
             return Coached(photos, advice=_first_words(bool(board), len(lit)))
         camera = self._camera(board, lit)
@@ -74,6 +77,13 @@ class Coach:
         missing = missing_sides(lights)
         return Coached(photos, lights, missing, next_words(lights, missing))
 
+    def _shows_board(self, path: Path) -> bool:
+        """Return whether a photo shows the board that session.toml names, or any where it names none."""
+        try:
+            return board_finder(load_settings(self.folder).board)(path)
+        except UserError:
+            return board_finder(None)(path)
+
     def _camera(self, board: list[str], lit: list[str]) -> PosedCamera | str:
         """Return the camera over the board, or why it is not found."""
         try:
@@ -85,7 +95,8 @@ class Coach:
             places = [self.folder / name for name in board]
             photos = tuple(self.folder / name for name in lit)
             try:
-                session = Session(self.folder, find_tripod_first(places, photos), photos, (), (), settings)
+                first = tripod_first(places, photos, self._first.seen)
+                session = Session(self.folder, first, photos, (), (), settings)
                 self._cameras = {key: fit_board(session)[0]}
             except (CalibrationError, CaptureError) as error:
                 self._cameras = {key: str(error)}

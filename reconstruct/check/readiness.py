@@ -14,9 +14,9 @@ from jaxtyping import Float
 from calibration.calibration import Calibration
 from calibration.lights.power import SHADING_MISFIT
 from capture.checks.board_alignment import BOARD_OFF
-from capture.checks.check_stack import Finding
 from capture.checks.framing import KINDS, REFRAMED, SEEN_FROM
 from capture.errors import ReconstructionError
+from capture.photos.finding import Finding
 from capture.session.session import ADVISED_LIT, FEWEST_LIT
 from reconstruct.check.light_coverage import ShadowCover, directions, side_in_words, widest_gap
 
@@ -144,7 +144,7 @@ def capture_facts(calibration: Calibration, findings: Sequence[Finding], cover: 
     power = np.log([max(float(light.power.mean()), LEAST_POWER) for light in used] or [1.0])
     off = np.zeros_like(power) if powers_mean_nothing(calibration) else np.abs(power - usual_log(power))
     return {
-        "photos": len({light.photo for light in calibration.lights}),
+        "photos": len({light.photo for light in calibration.lights} | _left_out(findings)),
         "photos_used": len({light.photo for light in used}),
         "widest_gap_deg": float(np.degrees(widest_gap(calibration, cover.centre)[1])),
         "lowest_light_deg": float(elevation.min(initial=90.0)),
@@ -164,13 +164,18 @@ def capture_facts(calibration: Calibration, findings: Sequence[Finding], cover: 
     }
 
 
+def _left_out(findings: Sequence[Finding]) -> set[str]:
+    """Return the names of the photos under the flashlight that are left out."""
+    return {finding.photo.name for finding in findings if finding.drop and finding.role == "lit"}
+
+
 MORE_LIGHTS = "Take more photos with the flashlight at other places, camera and focus untouched."
 
 
 def judge_photos(say: Judge, facts: dict[str, Any], findings: Sequence[Finding], is_part: bool = False) -> None:
     """Judge the number of photos, and what was found in them."""
     used, photos = facts["photos_used"], facts["photos"]
-    dropped = Counter(finding.kind for finding in findings if finding.drop)
+    dropped = Counter(finding.kind for finding in findings if finding.drop and finding.role == "lit")
     why = ", ".join(f"{count} {kind}" for kind, count in dropped.most_common())
     of_all = f"{used} of {photos} photos can be used" + (f" ({why})" if why else "")
     if used < FEWEST_LIT:

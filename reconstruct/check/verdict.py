@@ -13,9 +13,9 @@ import numpy as np
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
 from calibration.light import Light
-from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError, CaptureError
 from capture.files.title import title_of
+from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
 from capture.session.session import FEWEST_LIT
 from reconstruct.check.judge_views import judge_together

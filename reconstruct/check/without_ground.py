@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from calibration.calibration import Calibration
-from capture.checks.check_stack import Finding
+from capture.photos.finding import Finding
 from reconstruct.appearance.brdf import facing_reflectance
 from reconstruct.check.light_coverage import ShadowCover, directions
 from reconstruct.check.readiness import (

@@ -178,6 +178,8 @@ def _keep_scale(
 def _read(source: Source, options: RunOptions, run: RunFolder) -> AllPhotos:
     """Stage "capture": done by every invocation that needs photos; they stay in the run folder in the meantime."""
     with run.stage("capture", f"reading {len(source.photos())} photos", leaves_files=False):
+        for one in source.left_out():
+            run.progress(message=f"{one.called} is left out: {one.kind}, {one.text}")
         plan = _plan(source, options, run)
         if plan is not None:
             run.progress(message=plan.sentence)

@@ -109,7 +109,11 @@ def _photos(calibration: Calibration, view: str, is_solved: bool) -> list[dict[s
         ]
         for role in ("board", "side")
     )
-    rows = [row | ({"view": view} if view else {}) for row in (*boards, *lights, *sides)]
+    lacking = [
+        {"name": row["photo"], "role": row["role"], "used": False, "reason": row["reason"]}
+        for row in residuals.get("left_out_photos", [])
+    ]
+    rows = [row | ({"view": view} if view else {}) for row in (*boards, *lights, *sides, *lacking)]
     return rows if is_solved else [row | {"used": False, "reason": row["reason"] or NOT_LAID} for row in rows]
 
 

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from calibration.known_scene import KnownScene
 from calibration.scenes.ground_depth import read_ground_depth
 from capture.checks.check_stack import white_balance_finding
-from capture.checks.finding import Finding, keep_findings, kept_findings
 from capture.checks.moved_photos import check_and_register, register
 from capture.decode.formats import read_size
 from capture.errors import CaptureError
+from capture.photos.finding import Finding, keep_findings, kept_findings
 from capture.photos.photo import PhotoStack, read_alpha, read_grey, read_stack
 from capture.photos.radiometry import with_one_white_balance, without_ambient
 from capture.session.session import Session
@@ -116,7 +116,7 @@ def _photos_of_session(session: Session, options: RunOptions, kept: Path | None,
     if dark_stack is not None:
         stack = without_ambient(stack, dark_stack)
     stack, changed = with_one_white_balance(stack)
-    findings = (*findings, *map(white_balance_finding, changed, changed.values()))
+    findings = (*session.left_out, *findings, *map(white_balance_finding, changed, changed.values()))
     mask = _users_mask(session, stack) if options.mask == "auto" else None
     return Photos(stack, findings, mask=mask, plan=plan)
 

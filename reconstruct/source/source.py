@@ -5,7 +5,7 @@ from pathlib import Path
 
 from calibration.board.board import parse_board
 from calibration.board.corners import grey_of
-from calibration.board.recognise import guess_board
+from calibration.board.recognise import board_finder, guess_board
 from calibration.calibrate import WAYS
 from calibration.known_scene import KnownScene
 from calibration.scenes.ball_scene import load_with_ball
@@ -14,9 +14,11 @@ from calibration.scenes.importers import find_importer
 from calibration.scenes.listed_lights import load_listed
 from capture.errors import CaptureError, UserError
 from capture.files.names import clip_of, refuse_no_folder
+from capture.photos.finding import Finding
 from capture.photos.photo import read_photo
 from capture.session.capture import Capture, load_capture
 from capture.session.roles import NoBoardError
+from capture.session.seen import SeenPhotos
 from capture.session.session import SETTINGS_FILE, Session, load_settings, parse_length
 from reconstruct.source.options import AUTO, UNKNOWN, RunOptions, ground_option
 
@@ -113,9 +115,14 @@ class Source:
         assert self.known is not None
         return self.known.rgb_paths or self.known.shadow_paths or ()
 
+    def left_out(self) -> tuple[Finding, ...]:
+        """The photos of a capture that cannot be read, are copies, or have another size than the rest."""
+        sessions = () if self.capture is None else self.capture.sessions()
+        return tuple(one for session in sessions for one in session.left_out)
+
 
 def open_source(folder: Path, options: RunOptions) -> Source:
-    """Find out what a folder holds; reads names and headers only.
+    """Find out what a folder holds: reads names, and small copies of the photos of a capture.
 
     Raises:
         CaptureError, CalibrationError: the folder does not exist, or holds no input for a run.
@@ -161,7 +168,7 @@ def _opened(folder: Path, options: RunOptions, lights: Path | None) -> Source:
     if circle is not None and lights is None:
         return Source(folder, known=load_with_ball(folder, circle))
     try:
-        capture = load_capture(folder)
+        capture = load_capture(folder, SeenPhotos(board_finder(options.board or load_settings(folder).board)))
         is_bare = _may_lack_a_board(capture, options)
         if is_bare and lights is not None:
             raise NoBoardError(f"no photo in {folder} shows a board that others show too.")

@@ -197,5 +197,11 @@ def lit_photos(report: Mapping[str, Any], views: Sequence[CalibratedView]) -> di
         for view in views
         for light in view.calibration.lights
     ]
+    rows += [
+        {"view": view.name, "name": row["photo"], "used": False, "reason": row["reason"]}
+        for view in views
+        for row in view.calibration.residuals.get("left_out_photos", [])
+        if row["role"] == "lit"
+    ]
     rows = [row for row in report.get("photos", []) if row.get("role") == "lit"] or rows
     return {(f"{row['view']}/" if row.get("view") else "") + row.get("name", "-"): row for row in rows}

@@ -178,9 +178,12 @@ def _further(checked: CaptureCheck) -> str:
 def _photo_table(checked: CaptureCheck) -> str:
     rows = []
     for light in checked.calibration.lights:
-        said = [f"{f.kind}: {f.text}" for f in checked.findings if f.photo.name == light.photo]
+        said = [f"{f.kind}: {f.text}" for f in checked.findings if f.photo.name == light.photo and f.role == "lit"]
         said += [light.reason] if light.reason and light.reason not in said else []
         rows.append([light.photo, *_place(light, checked), "; ".join(said)])
+    known = {light.photo for light in checked.calibration.lights}
+    lacking = [one for one in checked.findings if one.drop and (one.role != "lit" or one.photo.name not in known)]
+    rows += [[one.called, "left out", "", "", "", f"{one.kind}: {one.text}"] for one in lacking]
     return doc.table(["Photo", "Flashlight", "Height", "Distance", "±", "Remarks"], rows, numbers=(2, 3, 4))
 
 
@@ -206,7 +209,7 @@ def check_lines(checked: CaptureCheck) -> list[str]:
     lines += filter(None, [scale_sentence(checked.calibration.residuals)])
     lines += ["", "Lights seen from above, camera at the bottom, o = used, x = not used:"]
     lines += polar_plot(checked.calibration, checked.cover)
-    lines += [f"{f.photo.name}: {f.kind}, {f.text}" for f in checked.findings]
+    lines += [f"{f.called}: {f.kind}, {f.text}" for f in checked.findings]
     lines += [f"{one.name}, {f.photo.name}: {f.kind}, {f.text}" for one in checked.further for f in one.findings]
     lines += [f"Shoot next: {advice}" for advice in readiness.advice]
     return lines

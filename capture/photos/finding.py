@@ -15,7 +15,8 @@ class Finding:
     """One fault of one photo: what was measured, the limit, and whether the photo has to be left out."""
 
     photo: Path
-    kind: str  # "flash off" | "over-exposed" | "exposure changed" | "white balance changed" | "ambient light" |
+    kind: str  # "unreadable" | "copy" | "another size" |
+    # "flash off" | "over-exposed" | "exposure changed" | "white balance changed" | "ambient light" |
     # "blurred" | "camera moved" | "camera moved from board" | "another scene" | "covered" | "registered" |
     # "framed otherwise" | "board from elsewhere" | "board not in this view" | "zoom stated" |
     # "view not compared"
@@ -25,6 +26,20 @@ class Finding:
     drop: bool
     homography: tuple[float, ...] | None = None  # of a "registered" photo, row by row: from the pixels of the common
     # view to its own, px of the stack that was checked; of capture.checks.framing: from the board's photo to the photos
+    role: str = "lit"  # of the photo, as its folder or its picture tells; of one that cannot be read, if nothing tells
+
+    @property
+    def called(self) -> str:
+        """The photo's name; with its folder's, unless it is one under the flashlight."""
+        return self.photo.name if self.role == "lit" else f"{self.photo.parent.name}/{self.photo.name}"
+
+
+def grouped(findings: Sequence[Finding]) -> str:
+    """Return what is wrong with several photos in one sentence part; photos with one fault stand together."""
+    names: dict[str, list[str]] = {}
+    for one in findings:
+        names.setdefault(f"{one.kind}, {one.text}".rstrip("."), []).append(one.called)
+    return "; ".join(f"{', '.join(some)}: {text}" for text, some in names.items())
 
 
 def keep_findings(folder: Path, findings: Sequence[Finding]) -> None:
