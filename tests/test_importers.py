@@ -525,9 +525,9 @@ def test_lights_below_the_ground_are_named(tmp_path):
 )
 def test_a_mask_beside_the_settings_is_the_object(tmp_path, size, split, words):
     pattern = np.random.default_rng(0).uniform(0.1, 0.5, (36, 48, 3))
-    for folder, count in (("board", 1), ("photos", 4)):
-        for i in range(count):
-            write_photo(tmp_path / folder / f"IMG_{i}.png", pattern * (1 + 0.2 * i))
+    write_photo(tmp_path / "board" / "IMG_0.png", pattern[::-1])
+    for i in range(4):
+        write_photo(tmp_path / "photos" / f"IMG_{i}.png", pattern * (1 + 0.2 * i))
     mask = np.ones(size[::-1])
     mask[:, :split] = 0
     write_grey(tmp_path / "mask.png", mask)
