@@ -15,6 +15,7 @@ from small_example import small_example
 
 import shadowgraph
 from calibration.board.board import parse_board
+from calibration.board.board_photos import fit_board
 from calibration.board.recognise import board_finder
 from calibration.camera import Camera
 from capture.checks.first_look import FirstLook
@@ -202,6 +203,19 @@ def test_a_board_is_found_in_a_close_up_and_not_on_a_bare_table(tmp_path, spec, 
     save_photo(tmp_path / "bare.jpg", lit_table.photograph(bare, np.random.default_rng(5)))
     shows = board_finder(spec if is_named else None)
     assert shows(tmp_path / "close.png") and not shows(tmp_path / "bare.jpg")
+
+
+@pytest.mark.parametrize("window", [(250, 180, 760, 563), (100, 300, 604, 678), (400, 80, 904, 458)])
+def test_a_zoomed_photo_of_the_board_does_not_spoil_the_tripods(tmp_path, window):
+    folder = save_capture(tmp_path)
+    (folder / "board" / "IMG_1.jpg").unlink()
+    board, camera = parse_board(BOARDS[0]), Camera(1008, 756, 1000.0, 1000.0, 503.5, 377.5)
+    tripod = Image.fromarray(board_photos.board_photo(board, camera, board_photos.look_at((60.0, -420.0, 380.0))))
+    tripod.convert("RGB").save(tmp_path / "board" / "IMG_1.png")
+    tripod.crop(window).resize(tripod.size).convert("RGB").save(tmp_path / "board" / "IMG_2.png")
+    (folder / "session.toml").write_text(f'board = "{BOARDS[0]}"\nroles = {{ board = ["board/IMG_1.png"] }}\n')
+    found = fit_board(load_session(folder))
+    assert found.posed_camera.centre == pytest.approx([60, -420, 380], abs=12)
 
 
 def test_a_phone_that_carries_the_light_is_still_told_from_the_board(tmp_path):

@@ -12,7 +12,7 @@ from calibration.board.board import AnyBoard, Board, parse_board
 from calibration.board.board_pose import ROBUST_AT, SAME_LENS, fit_ground
 from calibration.board.board_scale import marker_share, scale_doubts, scale_of
 from calibration.board.corners import Corners, Grey, find_board, grey_of, under_the_flashlight
-from calibration.board.intrinsics import CameraFit, fit_camera, sides_ratio
+from calibration.board.intrinsics import STRAY_PHOTO, STRAY_PHOTO_PX, CameraFit, fit_camera, sides_ratio
 from calibration.board.recognise import guess_board, is_mirrored
 from calibration.board.sheet_edges import find_edges
 from calibration.posed_camera import PosedCamera
@@ -48,6 +48,7 @@ class _Photo:
 
 
 COMMON = -1
+MISFIT = "with it, the tripod's photo was not explained; alone it was"
 
 
 def fit_board(session: Session, board_spec: str | None = None) -> BoardFit:
@@ -72,8 +73,9 @@ def fit_boards(
 
     The first board photo of a session is the tripod's and gives the ground; the others only improve the lens. Photos
     of one pixel size and one focal length by EXIF share the lens. A tripod's photo that does not fit that lens gets one
-    of its own: somebody zoomed. Where the tripod's photo shows no board, those under the flashlight are asked. Photos
-    whose pixel size differs from the tripod's are left out, because a crop cannot be distinguished from a turn.
+    of its own: somebody zoomed. If it is explained only without the others, it counts alone. Where
+    the tripod's photo shows no board, those under the flashlight are asked. Photos whose pixel size differs from the
+    tripod's are left out, because a crop cannot be distinguished from a turn.
 
     Args:
         sessions: of views of one board that lies still.
@@ -182,9 +184,16 @@ def _fit_group(
         rows = _rows(view, [one for one in extra if one in more], seen, fit)
         try:
             robust_at = ROBUST_AT if len(views) == 1 else ROBUST_NOISES * fit.solution.noise
-            fits.append(_above(view[0], fit, index, rows, notes, robust_at, is_named))
+            own: BoardFit | CalibrationError = _above(view[0], fit, index, rows, notes, robust_at, is_named)
         except CalibrationError as error:
-            fits.append(error)
+            own = error
+        off = np.inf if isinstance(own, CalibrationError) else fit.photo_rms_px[index]
+        if len(seen) > 1 and off > STRAY_PHOTO_PX:
+            others = [replace(photo, corners=None, reason=photo.reason or MISFIT) for photo in view[1:]]
+            alone = _fit_group([[view[0], *others]], (), notes, is_named)[0]
+            if isinstance(alone, BoardFit) and off > STRAY_PHOTO * alone.residuals["ground_rms_px"]:
+                own = alone
+        fits.append(own)
     return fits
 
 

@@ -11,6 +11,7 @@ from typing import TypeVar
 
 from capture.checks.check_stack import check_stack
 from capture.errors import CaptureError
+from capture.photos.finding import Finding
 from capture.photos.photo import Photo, PhotoStack, read_small_photo, stack_of
 from capture.session.contents import photos_of
 from capture.session.places import by_place
@@ -50,8 +51,10 @@ class FirstLook:
 
     def look(self) -> tuple[PhotoLook, ...]:
         """Return every photo of the capture with its role and faults. Nothing here fails because of one photo."""
-        views, remarks, is_read = self._sorted()
-        roles = {path: role for view in views for role in ROLE_FOLDERS for path in getattr(view, role)}
+        views, left_out, is_read = self._sorted()
+        roles = {one.photo: one.role for one in left_out}
+        roles |= {path: role for view in views for role in ROLE_FOLDERS for path in getattr(view, role)}
+        remarks: dict[Path, list[Remark]] = {one.photo: [(one.kind, one.text, True)] for one in left_out}
         places = {path: k for k, view in enumerate(views) for path in (*view.board, *view.lit)}
         every = [path for view in views for path in view.lit]
         self._photos = {path: self._photos[path] for path in every if path in self._photos}
@@ -76,8 +79,8 @@ class FirstLook:
             self._photos[path] = mark, read_small_photo(path, LONG_SIDE)
         return self._photos[path][1]
 
-    def _sorted(self) -> tuple[tuple[Session, ...], dict[Path, list[Remark]], set[Path]]:
-        """Return a session for each place of the tripod, why photos are left out, and all photos that were read."""
+    def _sorted(self) -> tuple[tuple[Session, ...], tuple[Finding, ...], set[Path]]:
+        """Return a session for each place of the tripod, which photos are left out, and all photos that were read."""
         try:
             settings = load_settings(self.folder)
             named = named_photos(self.folder, settings)
@@ -90,7 +93,7 @@ class FirstLook:
         views, rest = by_place(Session(self.folder, *photos, settings, side=roles.side), self.seen)
         views = (replace(views[0], board=(*views[0].board, *rest)), *views[1:])
         read = {path for paths in (*stored.values(), *named.values()) for path in paths}
-        return views, {one.photo: [(one.kind, one.text, True)] for one in left_out}, read
+        return views, left_out, read
 
     def _remarks(self, lit: Sequence[Path]) -> dict[Path, list[Remark]]:
         """Return the faults of lit photos. One that was judged once stays judged; `check` judges all together."""

@@ -65,6 +65,7 @@ class Checks:
         """Return the newest verdict, why none can be made, and whether one is being made."""
         place = self._place(capture)
         found: dict[str, Any] = {"verdict": "", "sentence": "", "reasons": [], "advice": [], "lights": [], "error": ""}
+        found["numbers"] = {}
         with contextlib.suppress(UserError):
             found |= {key: value for key, value in read_check(place / CHECK).items() if key in found}
             found["sentence"] = in_page_words(found["sentence"])

@@ -1,6 +1,7 @@
 """Library: the cards of the studio's first page, and all that is known of one capture or run."""
 
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from capture.errors import UserError
 from capture.files.regular import is_regular
 from capture.files.title import title_of
 from capture.intake.parts import Parts
-from capture.session.contents import clips_of, photos_of
+from capture.session.contents import clips_of, folder_role, photos_of
 from capture.session.session import load_settings
 from reconstruct.run.queue import FAILED, FINISHED, RUNNING, STOPPED, WAITING, Job, Queue
 from reconstruct.run_folder.folder import LOG
@@ -23,6 +24,14 @@ from viewer.studio.progress import run_progress
 
 PRESETS = ("draft", "standard", "fine", "paper")
 ARRIVING_S = 4.0  # after the last photo, the capture still counts as arriving
+
+ROLES = {
+    "lit": "under the flashlight",
+    "board": "of the board",
+    "light": "by the flashlight's phone",
+    "dark": "without light",
+    "side": "from the side",
+}
 
 
 class Library:
@@ -66,18 +75,22 @@ class Library:
         for photo in photos_of(path):
             name = photo.relative_to(path).as_posix()
             look = looks.get(name, {})
-            row = {"name": name, "role": look.get("role", ""), "remarks": look.get("remarks", [])}
-            photos.append({**row, "drop": look.get("drop", False), "looked": name in looks})
+            of_folder = folder_role(photo, path)
+            row = {"name": name, "role": look.get("role") or of_folder, "remarks": look.get("remarks", [])}
+            more = {"drop": look.get("drop", False), "looked": name in looks, "by_folder": bool(of_folder)}
+            photos.append(row | more)
         refused = [
             {"id": part.id, "name": part.name, "why": in_page_words(without_folder(why, path, "this capture"))}
             for part, why in self._parts.complaints(key)
         ]
+        check = self._checks.state(path)
         return card | {
             "photos": photos,
+            "counts": counts_of(photos, check),
             "clips": [clip.relative_to(path).as_posix() for clip in clips_of(path)],
             "board": _board_of(path),
             "refused": refused[-20:],
-            "check": self._checks.state(path),
+            "check": check,
             "coach": {"lights": coach["lights"], "advice": coach["advice"]},
         }
 
@@ -190,3 +203,34 @@ def _state(job: Job | None, is_running: bool, is_finished: bool, title: str) -> 
     if job is not None and job.state in (FAILED, STOPPED):
         return job.state, job.sentence or "Stopped. It goes on where it stood."
     return STOPPED, f"{title}. It was started in a terminal: the same command goes on where it stood."
+
+
+def counts_of(photos: Sequence[Mapping[str, Any]], check: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the counts of a capture, as sentences and numbers.
+
+    Args:
+        photos: `role`, `drop` and `looked` of each.
+        check: the newest verdict; its numbers count unless photos have changed since.
+
+    Returns:
+        `words`; `lit`, photos under the flashlight, and `used`, how many of them a run will use; `left_out`, photos of
+        any role that it will not use; `start`, what the button says that starts one; `uses`, the sentence beside it.
+    """
+    numbers = {} if check.get("is_old") else check.get("numbers", {})
+    lit = [photo for photo in photos if photo["role"] == "lit"]
+    total = int(numbers.get("photos", len(lit)))
+    used = int(numbers.get("photos_used", sum(not photo["drop"] for photo in lit)))
+    left_out = total - used + sum(bool(photo["drop"]) for photo in photos if photo["role"] != "lit")
+    counts = {role: sum(photo["role"] == role for photo in photos) for role in ROLES} | {"lit": total}
+    told = [f"{counts[role]} {words}" for role, words in ROLES.items() if counts[role]]
+    unseen = sum(not photo["role"] and not photo["looked"] for photo in photos)
+    told += [f"{unseen} not looked at yet"] if unseen else []
+    told += [f"{left_out} left out"] if left_out else []
+    start = "Start" if not left_out else f"Leave {'it' if left_out == 1 else left_out} out and go on"
+    uses = f"{used} of {total} {_photos(total)} under the flashlight will be used." if total and not unseen else ""
+    words = f"{len(photos)} {_photos(len(photos))}" + (f": {', '.join(told)}" if told else "")
+    return {"words": words, "lit": total, "used": used, "left_out": left_out, "start": start, "uses": uses}
+
+
+def _photos(count: int) -> str:
+    return "photo" if count == 1 else "photos"

@@ -208,8 +208,8 @@ class Studio:
         """Return what a phone that was let in may know of the capture that it sends to."""
         row = self.capture(key)
         bad = [{"name": one["name"], "remarks": one["remarks"]} for one in row["photos"] if one["drop"]]
-        known = {name: row[name] for name in ("title", "count", "coming", "refused", "check", "coach")}
-        return known | {"bad": bad, "lit": sum(one["role"] == "lit" for one in row["photos"])}
+        known = {name: row[name] for name in ("title", "count", "counts", "coming", "refused", "check", "coach")}
+        return known | {"bad": bad}
 
     # --- what is done ------------------------------------------------------------------------------------------------
 

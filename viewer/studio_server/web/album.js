@@ -1,6 +1,6 @@
 // A phone that sends photos from its library or camera app, and hears how they are.
 
-import { h, plural } from "./dom.js";
+import { h } from "./dom.js";
 import { dome } from "./hemisphere.js";
 import { complaint, picked, sending } from "./upload.js";
 import { voice } from "./voice.js";
@@ -25,7 +25,7 @@ export function album(phone) {
         sending(sender),
         sender.open.length > 0 && h("p", { class: "small quiet" }, "Keep this page open. If the network drops, it goes on by itself.")),
       h("section", { class: "panel", "aria-live": "polite" },
-        h("p", {}, `${plural(state.count, "photo")} in the capture${state.lit ? `, ${state.lit} under the flashlight` : ""}.`),
+        h("p", {}, `${state.counts.words}.`),
         state.bad.length > 0 && h("p", { class: "warn" }, "Take again: ", state.bad.slice(-5).map((one) => `${one.name} (${one.remarks[0][0]})`).join(", ")),
         state.refused.length > 0 && h("p", { class: "bad" }, state.refused.slice(-3).map((one) => complaint(one.name, one.why)).join(" ")),
         check.sentence && h("p", { class: `verdict ${check.verdict}` }, check.sentence),

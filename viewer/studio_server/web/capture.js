@@ -8,6 +8,7 @@ import { Sender, complaint, dropped, picked, sending } from "./upload.js";
 import { voice } from "./voice.js";
 
 const ROLES = { "": "found from the picture", board: "board", lit: "flashlight", light: "flashlight's phone", dark: "light off", side: "side photo" };
+const FOLDERS = { board: "board/", lit: "photos/", light: "light/", dark: "dark/", side: "side/" };
 const senders = new Map(); // they go on while another view is shown
 
 export function capture(name, again) {
@@ -55,7 +56,7 @@ export function capture(name, again) {
       row.refused.length > 0 && h("div", { class: "bad small" }, h("p", {}, "Not taken:"),
         h("ul", { class: "plain" }, row.refused.slice(-5).map((one) => h("li", {}, complaint(one.name, one.why), " ",
           h("button", { onclick: () => attempt(async () => { await change("dismiss", { key: row.key, part: one.id }); again(); }) }, "Dismiss"))))),
-      row.photos.length + row.clips.length > 0 && h("p", { class: "quiet" }, counts(row)),
+      row.photos.length + row.clips.length > 0 && h("p", { class: "quiet" }, row.counts.words),
       bad.length > 0 && h("p", { class: "warn" }, `Take again: ${bad.slice(0, 4).map((photo) => `${photo.name} (${photo.remarks[0][0]})`).join(", ")}`),
       row.clips.map((clip) => h("p", { key: clip }, `Clip: ${clip}`)),
       h("ul", { class: "photos" }, row.photos.map((photo) => thumb(row, photo))));
@@ -74,10 +75,11 @@ export function capture(name, again) {
     return h("span", { class: "chooser" }, input, h("button", { onclick: (event) => event.currentTarget.parentNode.querySelector("input").click() }, words));
   }
 
-  function counts(row) {
-    const [lit, board, side] = ["lit", "board", "side"].map((role) => row.photos.filter((photo) => photo.role === role).length);
-    const told = [plural(row.photos.length, "photo"), lit && `${lit} under the flashlight`, board && `${board} of the board`, side && `${side} from the side`];
-    return told.filter(Boolean).join(", ");
+  /** What a photo may show. Of one in the folder of a role the folder says it, and another choice moves it there. */
+  function roles(photo) {
+    const unknown = photo.looked && !photo.role ? "not clear yet" : ROLES[""];
+    return Object.entries(ROLES).filter(([role]) => role || !photo.by_folder).map(([role, words]) =>
+      h("option", { value: role, selected: role === photo.role }, role === "" ? unknown : photo.by_folder ? FOLDERS[role] : words));
   }
 
   function thumb(row, photo) {
@@ -89,7 +91,7 @@ export function capture(name, again) {
       h("select", { "aria-label": `What ${photo.name} shows`, value: photo.role, onchange: (event) => attempt(async () => {
         await change("role", { key: row.key, photo: photo.name, role: event.target.value });
         again();
-      }) }, Object.entries(ROLES).map(([role, words]) => h("option", { value: role, selected: role === photo.role }, role === "" && photo.looked ? "not clear yet" : words))),
+      }) }, roles(photo)),
       h("button", { "aria-label": `Delete ${photo.name}`, onclick: () => attempt(async () => {
         await change("delete_photo", { key: row.key, photo: photo.name });
         toast(`${photo.name} is in the trash.`);
@@ -152,7 +154,8 @@ export function capture(name, again) {
         h("input", { type: "radio", name: "preset", value, checked: value === preset, onchange: () => { preset = value; again(); } }),
         h("b", {}, title), h("div", { class: "small quiet" }, words, " ",
           time[value] ? `Takes ${about(time[value].seconds)} here, and ${bytes(time[value].bytes)} of memory${time[value].fits ? "" : ": more than is free"}.` : "Measuring this machine.")))),
-      h("button", { class: "main", disabled: row.photos.length + row.clips.length === 0 || sender.open.length > 0 || row.coming > 0, onclick: () => start(row) }, "Start"),
+      h("button", { class: "main", disabled: row.photos.length + row.clips.length === 0 || sender.open.length > 0 || row.coming > 0, onclick: () => start(row) }, row.clips.length ? "Start" : row.counts.start),
+      row.counts.uses && !row.clips.length && h("p", { class: "quiet small" }, row.counts.uses),
       row.photos.length + row.clips.length === 0 ? h("p", { class: "quiet small" }, "Photos first.")
         : (sender.open.length > 0 || row.coming > 0) && h("p", { class: "quiet small" }, "Starts once all photos are here."),
       row.check.verdict === "hopeless" && h("p", { class: "warn small" }, "These photos will not do, as the verdict says: a run would stop there."));

@@ -1,7 +1,7 @@
 // The live camera of a phone: exposure and focus locked, a photo at the press of a button, on the desktop's word, or by
 // itself once the light has moved and stands still. A second phone holds the light: its torch is on.
 
-import { attempt, change, h, plural } from "./dom.js";
+import { attempt, change, h } from "./dom.js";
 import { dome } from "./hemisphere.js";
 import { sending } from "./upload.js";
 import { voice } from "./voice.js";
@@ -105,7 +105,7 @@ export function live(phone) {
       role === "camera" && h("p", { class: "small quiet" }, locked.length ? `Locked: ${locked.join(", ")}.` : "This browser locks nothing: hold still, and keep the room as dark as it was. The camera app with uploads is better."),
       role === "light" && h("p", { class: isTorchOn ? "quiet" : "warn" }, isTorchOn ? "The torch is on. Hold the phone so that its camera sees the board, in another place for each shot."
         : "This browser cannot turn the torch on while its camera is open. Hold a flashlight against the phone, beside its camera, or let another phone hold the light."),
-      sending(phone.sender), h("p", {}, `${plural(state.count, "photo")} in the capture${state.bad.length ? `; take again: ${state.bad.map((one) => one.name).slice(-3).join(", ")}` : ""}.`),
+      sending(phone.sender), h("p", {}, `${state.counts.words}${state.bad.length ? `; take again: ${state.bad.map((one) => one.name).slice(-3).join(", ")}` : ""}.`),
       role === "camera" && loud.control(),
       role === "camera" && state.coach.advice && h("p", { class: "verdict", "aria-live": "polite" }, state.coach.advice),
       role === "camera" && state.coach.lights.length > 0 && dome(state.coach.lights.map((light) => ({ ...light, used: true })))].filter(Boolean);
