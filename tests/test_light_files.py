@@ -279,9 +279,9 @@ def test_a_table_of_places_is_read_as_places(tmp_path, head, scale, kind):
         (lambda: {"anything": np.round(unit_directions(), 4).astype(np.float32)}, "directional"),
     ],
 )
-@pytest.mark.parametrize("packed", [True, False])
-def test_arrays_of_matlab_are_read_by_their_usual_names(tmp_path, content, kind, packed):
-    scipy.io.savemat(tmp_path / "light.mat", content(), do_compression=packed)
+@pytest.mark.parametrize("how", [{"do_compression": True}, {"do_compression": False}, {"format": "4"}])
+def test_arrays_of_matlab_are_read_by_their_usual_names(tmp_path, content, kind, how):
+    scipy.io.savemat(tmp_path / "light.mat", content(), **how)
     given = read_lights(tmp_path / "light.mat", PHOTOS, POSED_CAMERA)
     if kind == "directional":
         assert_towards_the_lights(given)

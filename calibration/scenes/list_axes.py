@@ -117,20 +117,21 @@ def judged(stack: PhotoStack, lights: Sequence[Light], orientation: int) -> list
 
 
 def _sentence(tested: AxesTest, way: int, orientation: int) -> str:
-    other = way // 4 * 4 + (way + 2) % 4
-    figures = f"as listed the object is a hollow (roundness {tested.bulge[0]:+.2f}, a ball has +1)"
-    if way != 2:
-        rest = min(curl for one, curl in enumerate(tested.curl) if one not in (way, other, 0, 2))
-        figures = (
-            f"so the slopes that shading gives miss a surface by {tested.curl[way]:.2f}, as listed by "
-            f"{tested.curl[0]:.2f}, in the next of the eight ways by {rest:.2f} (1 is the worst)"
-        )
     why = (
         f", in the frame of the upright photos (EXIF orientation {orientation})" if way == UPRIGHT[orientation] else ""
     )
+    if way == 2:
+        return (
+            f"as listed the object is a hollow (roundness {tested.bulge[0]:+.2f}, a ball has +1). If it is none, the "
+            f"list of lights is {NAMES[way]}{why}. Nothing was changed. Write {_row(way)} for x y z in the list then"
+        )
+    other = way // 4 * 4 + (way + 2) % 4
+    rest = min(curl for one, curl in enumerate(tested.curl) if one not in (way, other, 0, 2))
     return (
-        f"the list of lights seems {NAMES[way]}{why}: {figures}. Nothing was changed. Write {_row(way)} for x y z in "
-        f"the list, or {_row(other)} if hills come out as hollows"
+        f"the list of lights seems {NAMES[way]}{why}: so the slopes that shading gives miss a surface by "
+        f"{tested.curl[way]:.2f}, as listed by {tested.curl[0]:.2f}, in the next of the eight ways by {rest:.2f} (1 is "
+        f"the worst). Nothing was changed. Write {_row(way)} for x y z in the list, or {_row(other)} if hills come out "
+        "as hollows"
     )
 
 
