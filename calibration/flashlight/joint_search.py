@@ -55,6 +55,7 @@ def searched(starts: Sequence[Float[np.ndarray, "photos 3"]], evidence: Evidence
         starts: positions, world.
         evidence: with outlines; photos that these do not trust are placed by their shading.
     """
+    assert evidence.outlines is not None
     trusted = _trusted(evidence)
     found = []
     for number, one in enumerate(starts):
