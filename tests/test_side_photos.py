@@ -62,7 +62,7 @@ def test_photos_in_side_and_the_height_are_read(tmp_path):
     folder, _, _ = save_capture(tmp_path, in_folders=True)
     (folder / "side").mkdir()
     for i in range(2):
-        (folder / "side" / f"S{i}.jpg").write_bytes((folder / "board" / "IMG_8.jpg").read_bytes())
+        (folder / "side" / f"S{i}.jpg").write_bytes((folder / "board" / f"IMG_{8 + i}.jpg").read_bytes())
     (folder / "session.toml").write_text('height = "120 +- 2"\n')
     session = load_session(folder)
     assert names(session.side) == ["S0.jpg", "S1.jpg"]
