@@ -71,7 +71,7 @@ def test_asking_a_few_heights_first_finds_the_same(monkeypatch):
 
 def test_a_surface_that_misses_held_out_shadows_says_so():
     assert misfit({"loss_held_out": 0.05}) == [] and misfit({}) == []
-    assert "off by 18 %" in misfit({"loss_held_out": 0.18})[0]
+    assert "wrong by 18 %" in misfit({"loss_held_out": 0.18})[0]
 
 
 def test_pieces_in_the_air_are_warned_of_and_objects_on_the_ground_are_not():

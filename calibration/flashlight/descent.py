@@ -53,7 +53,8 @@ def descend(
     derivative along it (geodesic acceleration) [Transtrum and Sethna, Improvements to the Levenberg-Marquardt algorithm
     for nonlinear least-squares minimization, arXiv:1201.5885 (2012)].
     """
-    matrix, downhill = normal_equations(flashlights, evidence, weight, priors)
+    slopes = jacobian(flashlights, evidence)
+    matrix, downhill = normal_equations(flashlights, evidence, weight, priors, slopes)
     basis = csr_array(tangent(flashlights))  # a few entries per row: dense products would cost as much as all the rest
     matrix, downhill = basis.T @ matrix @ basis, basis.T @ downhill
     before = cost(flashlights, evidence, weight, priors)
@@ -62,7 +63,8 @@ def descend(
         step = cho_solve(damped, downhill)
         if step @ downhill < SETTLED * before:
             break
-        bend = cho_solve(damped, basis.T @ _bend(flashlights, evidence, weight, basis @ step))
+        curved = _curvature(flashlights, evidence, weight, basis @ step)
+        bend = cho_solve(damped, basis.T @ pulled(slopes, weight * curved / 2))
         size, bent = (float(np.linalg.norm(np.sqrt(np.diag(matrix)) * one)) for one in (step, bend))
         step += min(1.0, MOST_BENT * size / max(bent, 1e-30)) * bend
         trial = flashlights.moved(basis @ step, evidence.height)
@@ -72,14 +74,13 @@ def descend(
     return flashlights, damping
 
 
-def _bend(
+def _curvature(
     flashlights: Flashlights, evidence: Evidence, weight: Samples, step: Float[np.ndarray, " full"]
-) -> Float[np.ndarray, " full"]:
-    """Return J' W times half the second derivative of the cells' residuals along a step, by central differences."""
+) -> Samples:
+    """Return the second derivative of the cells' residuals along a step, by central differences."""
     ends = (flashlights.moved(share * step, evidence.height) for share in (PART, -PART))
     ahead, back = (cell_residuals(one, evidence, weight) for one in ends)
-    curved = (ahead - 2 * cell_residuals(flashlights, evidence, weight) + back) / PART**2
-    return pulled(jacobian(flashlights, evidence), weight * curved / 2)
+    return (ahead - 2 * cell_residuals(flashlights, evidence, weight) + back) / PART**2
 
 
 def ground_cells_of(weight: Samples, evidence: Evidence) -> Bool[np.ndarray, " cells"]:

@@ -288,15 +288,24 @@ def pulled(jacobian: tuple[np.ndarray, np.ndarray], weighted: Samples) -> Float[
     return np.concatenate([by_photo, np.einsum("kj,kjg->g", weighted, shared), np.zeros(3)])
 
 
-def normal_equations(flashlights: Flashlights, evidence: Evidence, weight: Samples, priors: Priors):
+def normal_equations(
+    flashlights: Flashlights,
+    evidence: Evidence,
+    weight: Samples,
+    priors: Priors,
+    slopes: tuple[np.ndarray, np.ndarray] | None = None,
+):
     """Return J' W J and J' W r in the full coordinates with priors; albedo is eliminated by its Schur complement.
 
     Triggs et al., Bundle Adjustment - A Modern Synthesis (2000), section 6. Full coordinates: per photo position (world
     length), a point on the beam axis (world length), log power, [oval 2]; then the beam's terms, ambient, mean aim.
+
+    Args:
+        slopes: of `jacobian`, where the caller has them.
     """
     n, own = len(flashlights.positions), flashlights.per_flashlight()
     residual = cell_residuals(flashlights, evidence, weight)
-    flashlight, shared = jacobian(flashlights, evidence)
+    flashlight, shared = jacobian(flashlights, evidence) if slopes is None else slopes
     cut = own * n
     full = cut + shared.shape[-1] + 3
     weighted = weight[..., None] * flashlight
@@ -315,9 +324,9 @@ def normal_equations(flashlights: Flashlights, evidence: Evidence, weight: Sampl
     downhill = pulled((flashlight, shared), weight * residual)
     value, jac = _prior_terms(flashlights, evidence, priors)
     if evidence.outlines is not None:
-        more, slopes = evidence.outlines.rows(flashlights.positions)
+        more, by_place = evidence.outlines.rows(flashlights.positions)
         wide = np.zeros((len(more), full))
-        wide[:, :cut].reshape(len(more), n, own)[:, :, :3] = slopes
+        wide[:, :cut].reshape(len(more), n, own)[:, :, :3] = by_place
         value, jac = np.concatenate([value, more]), np.concatenate([jac, wide])
     jac = csr_array(jac)
     return matrix + (jac.T @ jac).toarray(), downhill - jac.T @ value
