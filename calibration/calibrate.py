@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -86,7 +85,7 @@ def calibrate(
     )
     notes = [*session.notes, *residuals.get("notes", []), *framing_notes, *notes, *side_notes(sides)]
     wider = doubt.of_ground(posed_camera, residuals)
-    rows = {"side_photos": [side.row() for side in sides], "left_out_photos": left_out_rows(session)}
+    rows = {"side_photos": [side.row() for side in sides], "left_out_photos": [one.row() for one in session.left_out]}
     residuals = residuals | fit.residuals | wider | {"notes": notes} | rows
     shared = {"beam": fit.beam, "ambient": fit.ambient, "residuals": residuals, "side_views": cues.views}
     return Calibration.of(posed_camera, every, **shared)
@@ -110,11 +109,6 @@ def with_camera_error(
             error = np.maximum(np.diag(by_pose @ covariance @ by_pose.T), 0)
         found.append(replace(light, sigma=np.sqrt(np.square(light.sigma) + error)))
     return tuple(found)
-
-
-def left_out_rows(session: Session) -> list[dict[str, Any]]:
-    """Return the photos that reading left out as a calibration's residuals have them: photo, role, reason."""
-    return [{"photo": x.photo.name, "role": x.role, "reason": f"{x.kind}: {x.text}"} for x in session.left_out]
 
 
 def left_out(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[dict[str, str], Bool[np.ndarray, " photos"]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.board.board import parse_board
 from calibration.board.board_photos import fit_board
-from calibration.calibrate import calibrate, left_out, left_out_rows, refuse_other_size
+from calibration.calibrate import calibrate, left_out, refuse_other_size
 from calibration.calibration import Calibration
 from calibration.known_scene import KnownScene
 from calibration.light import Light
@@ -22,6 +22,7 @@ from calibration.posed_camera import PosedCamera
 from calibration.reframed import reframed
 from calibration.side_photos.side_views import metric_cues, side_notes
 from capture.errors import CalibrationError
+from capture.files.names import natural_order
 from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack, reduced
 from capture.session.session import Session
@@ -49,7 +50,9 @@ def calibrate_with_file(
     posed_camera, lens, residuals = fit_board(session, board_spec)
     refuse_other_size(posed_camera.camera, stack)
     posed_camera, framing_notes, _ = reframed(posed_camera, stack, findings)
-    given = read_lights(path, [photo.name for photo in stack.paths], posed_camera)
+    lit = [*stack.paths, *(one.photo for one in session.left_out if one.role == "lit")]
+    every = [photo.name for photo in sorted(lit, key=natural_order)]
+    given = read_lights(path, [photo.name for photo in stack.paths], posed_camera, every)
     _refuse_other_count(given, session.settings.declared.lights_at_once, path)
     dropped, usable = left_out(stack, findings)
     notes = [*session.notes, *residuals.get("notes", []), *framing_notes, f"lights: from {path}", *given.notes]
@@ -69,7 +72,7 @@ def calibrate_with_file(
     board = parse_board(residuals["board"])
     cues, sides = metric_cues(session, stack, usable, posed_camera, board, lens.on_sheet)
     notes += side_notes(sides)
-    rows = {"side_photos": [side.row() for side in sides], "left_out_photos": left_out_rows(session)}
+    rows = {"side_photos": [side.row() for side in sides], "left_out_photos": [one.row() for one in session.left_out]}
     residuals = residuals | {"notes": notes} | rows
     shared = {"beam": given.beam, "ambient": ambient, "residuals": residuals, "side_views": cues.views}
     return Calibration.of(posed_camera, lights, **shared)
@@ -117,7 +120,7 @@ def scene_with_file(scene: KnownScene, stack: PhotoStack | None, path: Path) -> 
     """
     own = scene.with_notes()
     photos = list(dict.fromkeys(light.photo for light in own.lights))
-    given = read_lights(path, photos, own.posed_camera)
+    given = read_lights(path, photos, own.posed_camera, scene.every_photo)
     _refuse_below(given.lights, own.ground_height, path)
     ambient = own.ambient if given.ambient is None else given.ambient
     lit = replace(own, lights=given.lights, beam=given.beam, ambient=ambient)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from calibration.calibration import Calibration
+from capture.photos.finding import Finding
 
 
 @dataclass(frozen=True)
@@ -25,12 +26,15 @@ class KnownScene:
     dark_paths: tuple[Path, ...] = ()  # photos without light, which are subtracted
     lights_from: Path | None = None  # the user's file of lights that they come from
     notes: tuple[str, ...] = ()  # what was found, and what had to be assumed
+    photos_left_out: tuple[Finding, ...] = ()  # unreadable, or of another size; their lights are left out as well
+    every_photo: tuple[str, ...] = ()  # names in the order of the scene's files, before any was left out
 
     def with_notes(self) -> Calibration:
-        """Return the calibration with the notes among its residuals, from which terminal and report take them."""
+        """Return the calibration with notes and left-out photos among its residuals, for terminal and report."""
         residuals = self.calibration.residuals
         notes = [*residuals.get("notes", []), *self.notes]
-        return replace(self.calibration, residuals=residuals | {"notes": notes}) if notes else self.calibration
+        said = {"notes": notes, "left_out_photos": [one.row() for one in self.photos_left_out]}
+        return replace(self.calibration, residuals=residuals | {key: rows for key, rows in said.items() if rows})
 
 
 @runtime_checkable

@@ -471,9 +471,9 @@ def test_the_focal_length_of_exif_is_the_cameras_unless_the_picture_was_cropped(
     exif.get_ifd(0x8769).update({41989: 70, 40962: 300, 40963: 200})
     for name, size in (("whole.jpg", (150, 100)), ("cropped.jpg", (100, 100))):
         Image.new("RGB", size, (90, 90, 90)).save(tmp_path / name, exif=exif)
-    whole, said = picture_camera(tmp_path / "whole.jpg")
+    whole, said = picture_camera([tmp_path / "whole.jpg"])
     assert whole.camera.fx == pytest.approx(70 / 43.27 * np.hypot(150, 100)) and "EXIF" in said
-    cropped, said = picture_camera(tmp_path / "cropped.jpg")
+    cropped, said = picture_camera([tmp_path / "cropped.jpg"])
     assert cropped.camera.fx == 1000 and "assumed" in said
 
 

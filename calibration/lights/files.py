@@ -49,10 +49,13 @@ class GivenLights:
     is_by_number: bool = False  # matched by the numbers in the photos' names, of a list that is longer
 
 
-def read_lights(path: Path, photos: Sequence[str], posed_camera: PosedCamera) -> GivenLights:
+def read_lights(path: Path, photos: Sequence[str], posed_camera: PosedCamera, every: Sequence[str] = ()) -> GivenLights:
     """Read the lights of a capture's photos from a file, world frame.
 
     A file without names is matched by order; if it lists more lights than photos, by the number in their names.
+
+    Args:
+        every: all photos, before some were left out: the order counts these; `photos` if empty.
 
     Raises:
         CalibrationError: the file cannot be read, is of no known kind, or lacks the light of a photo; names the error
@@ -61,9 +64,9 @@ def read_lights(path: Path, photos: Sequence[str], posed_camera: PosedCamera) ->
     if not path.is_file() or path.stat().st_size > LARGEST_FILE:
         raise CalibrationError(f"{path} is not a file of at most {LARGEST_FILE >> 20} MB; a file of lights was needed.")
     if path.suffix.lower() == ".npz":
-        return _matched(shadowneus_real_rows(path, posed_camera), photos, path)
+        return _matched(shadowneus_real_rows(path, posed_camera), photos, path, every)
     if is_number_list(path):
-        return _matched(number_rows(path, posed_camera), photos, path)
+        return _matched(number_rows(path, posed_camera), photos, path, every)
     content = read_json(path)
     document = JsonField(content, str(path))
     if "format" in content and "camera" in content:
@@ -71,11 +74,11 @@ def read_lights(path: Path, photos: Sequence[str], posed_camera: PosedCamera) ->
     if "lights" in content:
         return _listed(document, photos, path)
     if "light_pos" in content:
-        return _matched(s3nerf_rows(document, posed_camera), photos, path)
+        return _matched(s3nerf_rows(document, posed_camera), photos, path, every)
     if "frames" in content:
-        return _matched(shadowneus_rows(document, path, posed_camera), photos, path)
+        return _matched(shadowneus_rows(document, path, posed_camera), photos, path, every)
     if "directions" in content or "positions3d" in content or "positions" in content:
-        return _matched(dome_rows(document, posed_camera), photos, path)
+        return _matched(dome_rows(document, posed_camera), photos, path, every)
     raise CalibrationError(
         f"{path} is of no known kind (its entries: {', '.join(list(content)[:6]) or 'none'}). {READABLE}."
     )
@@ -164,24 +167,24 @@ def _by_name(lights: Sequence[Light], names: Sequence[str], photos: Sequence[str
     return tuple(replace(light, photo=photo) for photo in photos for light in by_name[bare(photo)])
 
 
-def _matched(rows: Rows, photos: Sequence[str], path: Path) -> GivenLights:
+def _matched(rows: Rows, photos: Sequence[str], path: Path, every: Sequence[str]) -> GivenLights:
     """Match rows as lights to photos: by name, else by order, else by number."""
-    known = {bare(photo) for photo in photos}
+    known, every = {bare(photo) for photo in photos}, list(every or photos)
     is_named = all(name is not None for name in rows.names) and known <= {bare(n) for n in rows.names if n}
     lights = list(rows.lights())
     notes, is_by_number = [rows.note] if rows.note else [], False
     if is_named:
         found = _by_name(lights, [n or "" for n in rows.names], photos, path)
         return GivenLights(found, False, notes=tuple(notes), unit=rows.unit)
-    if len(lights) == len(photos):
-        order = list(range(len(photos)))
+    if len(lights) == len(every):
+        order = [every.index(photo) for photo in photos]
         notes.append(f"lights: {path.name} matched to the photos by order, not by name")
     else:
         order, is_by_number = _numbers(photos, rows.first, len(lights)), True
         notes.append(f"lights: {path.name} matched to the photos by the number in their names")
     if order is None:
         raise NoMatchError(
-            f"{path} lists {len(lights)} lights for {len(photos)} photos, and neither its names nor the numbers in the "
+            f"{path} lists {len(lights)} lights for {len(every)} photos, and neither its names nor the numbers in the "
             "photos' names assign them; one light for each photo was needed. Name the photos in the file."
         )
     found = tuple(replace(lights[k], photo=photo) for k, photo in zip(order, photos, strict=True))

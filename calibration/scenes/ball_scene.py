@@ -9,6 +9,7 @@ from calibration.lights.shiny_ball import GROWN, Ball, find_ball, lights_of
 from calibration.scenes.distant_camera import distant_light, distant_scene, picture_camera
 from capture.errors import CalibrationError, CaptureError
 from capture.photos.photo import read_stack
+from capture.session.scene_photos import scene_photos
 
 LONG_SIDE = 1000  # px of the pictures in which ball and highlights are measured
 FEWEST_LIGHTS = 4  # photos whose highlight was found
@@ -33,8 +34,9 @@ def load_with_ball(folder: Path, circle: tuple[float, float, float] | None) -> K
         if circle is None:
             return None
         raise CaptureError(f"{len(photos)} photos found in {folder}, at least {FEWEST_LIGHTS} were needed.")
-    posed_camera, camera_note = picture_camera(photos[0])
-    stack = read_stack(photos, LONG_SIDE)
+    usable = scene_photos(photos)
+    posed_camera, camera_note = picture_camera(usable.paths)
+    stack = read_stack(usable.paths, LONG_SIDE)
     ball = find_ball(stack) if circle is None else Ball(*circle)
     if ball is None:
         return None
@@ -62,6 +64,6 @@ def load_with_ball(folder: Path, circle: tuple[float, float, float] | None) -> K
         f"{ball.radius:.0f} px, {how}; within {degrees:.1f} degrees at worst. The ball is left out of the object"
     )
     scene = distant_scene(
-        photos, lights, posed_camera, photos[0].parent / MASK, (note, camera_note), dark=dark_photos(folder, photos)
+        usable, lights, posed_camera, photos[0].parent / MASK, (note, camera_note), dark=dark_photos(folder, photos)
     )
     return replace(scene, left_out=(ball.x, ball.y, GROWN * ball.radius))

@@ -17,6 +17,7 @@ from calibration.scenes.distant_camera import distant_light, distant_scene, pict
 from capture.decode.formats import decode
 from capture.errors import CalibrationError
 from capture.files.json_field import read_text
+from capture.session.scene_photos import scene_photos
 
 DIRECTIONS, INTENSITIES, NAMES, MASK = "light_directions.txt", "light_intensities.txt", "filenames.txt", "mask.png"
 
@@ -38,7 +39,9 @@ class Diligent:
             CalibrationError, CaptureError: a file is missing or damaged, or the files do not fit each other.
         """
         towards = _table(folder / DIRECTIONS)
-        photos, how = _photos(folder, len(towards))
+        listed, how = _photos(folder, len(towards))
+        photos = scene_photos(listed)
+        place = photos.paths[0].parent
         strength = np.ones_like(towards)
         if (folder / INTENSITIES).is_file():
             strength = _table(folder / INTENSITIES, len(towards))
@@ -48,14 +51,14 @@ class Diligent:
                 f"{folder}: light {row + 1} is {strength[row].tolist()} from {towards[row].tolist()}; an intensity "
                 f"above 0 and a direction were needed. Correct {INTENSITIES} or {DIRECTIONS}."
             )
-        is_linear = True if decode(photos[0]).pixels.dtype != np.uint8 else None
-        posed_camera, camera_note = picture_camera(photos[0])
-        rows = zip(photos, towards, strength / strength.mean(), strict=True)
+        is_linear = True if decode(photos.paths[0]).pixels.dtype != np.uint8 else None
+        posed_camera, camera_note = picture_camera(photos.paths)
+        rows = zip(listed, towards, strength / strength.mean(), strict=True)
         lights = tuple(distant_light(path.name, where, power) for path, where, power in rows)
         curve = "; pixel values linear, as 16-bit files of this layout are" if is_linear else ""
         found = f"lights: {len(lights)} directions, photos {how}{curve}"
         notes, has_ratios = (found, camera_note), (folder / INTENSITIES).is_file()
-        mask = next((place / MASK for place in (folder, photos[0].parent) if (place / MASK).is_file()), folder / MASK)
+        mask = folder / MASK if (folder / MASK).is_file() else place / MASK
         return distant_scene(
             photos,
             lights,
@@ -64,7 +67,7 @@ class Diligent:
             notes,
             is_linear,
             has_ratios=has_ratios,
-            dark=dark_photos(folder, photos),
+            dark=dark_photos(folder, listed),
         )
 
 

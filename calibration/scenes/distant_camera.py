@@ -21,6 +21,8 @@ from calibration.scenes.unstated import read_shading
 from capture.decode.exif import focal_in_pixels, focal_of, orientation_of
 from capture.decode.formats import read_exif, read_size
 from capture.errors import CaptureError
+from capture.session.scene_photos import ScenePhotos
+from capture.session.seen import each_or_fault, usual_size
 
 LOOKING_DOWN = np.diag([1.0, -1.0, -1.0])  # world from camera: x right, image down is -y, forward is -z
 FAR = 10.0  # focal length over the picture's longer side: rays are parallel to 3 degrees, as a long lens's are
@@ -37,16 +39,20 @@ def distant_camera(width: int, height: int) -> PosedCamera:
     return PosedCamera(camera, Pose(LOOKING_DOWN, np.array([0.0, 0.0, focal])), 0.0)
 
 
-def picture_camera(photo: Path) -> tuple[PosedCamera, str]:
-    """Return the camera of a photo that stands for all, with EXIF's focal length or FAR away, and a note on that.
+def picture_camera(photos: Sequence[Path]) -> tuple[PosedCamera, str]:
+    """Return the camera of the first photo of the usual size, with EXIF's focal length or FAR away, and a note on that.
 
     It looks along -z at the origin from a height of its focal length in pixels; the ground is assumed at z = 0.
 
     Raises:
-        CaptureError: not a photo.
+        CaptureError: none of them is a photo.
     """
-    width, height = read_size(photo)
-    exif = read_exif(photo)
+    sizes = each_or_fault(read_size, photos)
+    known = [size for size in sizes if not isinstance(size, str)]
+    if not known:
+        raise CaptureError(f"{photos[0]}: {sizes[0]}")
+    width, height = usual_size(known)
+    exif = read_exif(photos[sizes.index((width, height))])
     focal_35mm = focal_of(exif)
     if focal_35mm is None or _is_cropped(exif.get_ifd(EXIF_TAGS), width, height):
         distant = distant_camera(width, height)
@@ -84,7 +90,7 @@ def distant_light(photo: str, towards: Vector, power: Vector | None = None) -> L
 
 
 def distant_scene(
-    photos: list[Path],
+    photos: ScenePhotos,
     lights: tuple[Light, ...],
     posed_camera: PosedCamera,
     mask: Path,
@@ -97,7 +103,7 @@ def distant_scene(
     """Return the scene of a picture's own camera over an unknown ground, with warnings if photos contradict the lights.
 
     Args:
-        photos, lights: in the same order; the lights in the picture's frame.
+        photos, lights: the lights in the picture's frame; those of photos that are left out are left out, too.
         posed_camera: of picture_camera.
         mask: bright on the object; the file may be missing.
         notes: how lights and camera were found, for the report.
@@ -110,16 +116,17 @@ def distant_scene(
         CaptureError: a photo cannot be read.
         CalibrationError: no pixel sees the ground under any light.
     """
-    unused: list[str] = []
+    unused, paths, names = [], photos.paths, {path.name for path in photos.paths}
+    lights = tuple(light for light in lights if light.photo in names)
     try:
-        shading = read_shading(photos, lights, is_linear, has_power or has_ratios, dark)
+        shading = read_shading(paths, lights, is_linear, has_power or has_ratios, dark)
     except CaptureError as error:
         if not dark:
             raise
         unused, dark = [f"{dark[0].parent} is not used: {error}"], ()
-        shading = read_shading(photos, lights, is_linear, has_power or has_ratios)
+        shading = read_shading(paths, lights, is_linear, has_power or has_ratios)
     small, lights = shading.stack, shading.lights
-    orientation = orientation_of(read_exif(photos[0]))
+    orientation = orientation_of(read_exif(paths[0]))
     if orientation > 1:
         notes = (
             *notes,
@@ -131,7 +138,7 @@ def distant_scene(
     calibration = Calibration.of(posed_camera, lights, unit="scene", residuals=residuals)
     return KnownScene(
         calibration if has_power else with_common_power(calibration, small),
-        tuple(photos),
+        tuple(paths),
         None,
         mask if mask.is_file() else None,
         mask_is_grey=True,
@@ -139,4 +146,6 @@ def distant_scene(
         is_linear=shading.is_linear,
         dark_paths=tuple(dark),
         notes=(*notes, *shading.notes, SCALE_NOTE),
+        photos_left_out=photos.left_out,
+        every_photo=photos.every,
     )

@@ -1,5 +1,6 @@
 """Choose the importer for a folder: one of the layouts of other programs, or a capture of our own."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from calibration.known_scene import Importer, KnownScene
@@ -13,6 +14,7 @@ from calibration.scenes.shadowneus import ShadowNeus
 from calibration.scenes.shadowneus_real import ShadowNeusReal
 from capture.errors import CaptureError
 from capture.files.names import refuse_no_folder
+from capture.photos.finding import grouped
 from capture.session.session import load_settings
 
 IMPORTERS: tuple[Importer, ...] = (
@@ -92,5 +94,7 @@ def import_folder(folder: Path, split: str, out: Path) -> tuple[Importer, KnownS
             "import: `shadowgraph run` reads it."
         )
     scene = importer.load(folder, split)
+    if scene.photos_left_out:
+        scene = replace(scene, notes=(*scene.notes, f"left out: {grouped(scene.photos_left_out)}"))
     save_scene(scene, importer.layout, out)
     return importer, scene

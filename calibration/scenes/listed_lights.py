@@ -22,6 +22,7 @@ from calibration.posed_camera import PosedCamera
 from calibration.scenes.distant_camera import distant_light, distant_scene, picture_camera
 from capture.decode.formats import read_size
 from capture.errors import CalibrationError, CaptureError
+from capture.session.scene_photos import ScenePhotos, scene_photos
 
 MASK = "mask.png"
 KINDS = (
@@ -81,22 +82,23 @@ def load_listed(folder: Path, source: Path) -> KnownScene:
         photos = max(stocks, key=len)
         if not photos:
             raise CalibrationError(f"no photos found in {folder}; those whose lights {source} gives were needed.")
-    posed_camera, camera_note = picture_camera(photos[0])
-    given = read_lights(source, [path.name for path in photos], posed_camera)
-    note = f"lights: from {source.name}, for each of {len(photos)} photos and none of a board"
+    usable = scene_photos(photos)
+    posed_camera, camera_note = picture_camera(usable.paths)
+    given = read_lights(source, [path.name for path in usable.paths], posed_camera, usable.every)
+    note = f"lights: from {source.name}, for each of {len(usable.paths)} photos and none of a board"
     if is_calibration(source):
-        return _with_its_camera(photos, load_calibration(source), given, note)
+        return _with_its_camera(usable, load_calibration(source), given, note)
     lights = _in_front(given.lights, given.unit, posed_camera, source)
     notes, dark = (note, *given.notes, camera_note), dark_photos(folder, photos)
     mask = photos[0].parent / MASK
-    return distant_scene(photos, lights, posed_camera, mask, notes, has_power=given.has_power, dark=dark)
+    return distant_scene(usable, lights, posed_camera, mask, notes, has_power=given.has_power, dark=dark)
 
 
 def _of_rows(folder: Path, source: Path) -> KnownScene | None:
     """Return the scene of a list that may name some of the photos only; None for one without names."""
     beside = source.parent if source.resolve().is_relative_to(folder.resolve()) else folder
     folders = [beside, *(place for place in folders_of(folder) if place != beside)]
-    first = next((photo for place in folders for photo in photos_in(place)[:1]), None)
+    first = next((photos for place in folders if (photos := photos_in(place))), None)
     if first is None:
         raise CalibrationError(f"no photos found in {folder}; those whose lights {source} gives were needed.")
     posed_camera, camera_note = picture_camera(first)
@@ -109,9 +111,8 @@ def _of_rows(folder: Path, source: Path) -> KnownScene | None:
     how_read = () if rows.note == view_note(posed_camera) else (rows.note,)
     notes = (f"lights: {len(lights)} {kind} from {source.name}, photos {how}", *how_read, camera_note)
     dark, mask = dark_photos(folder, photos), photos[0].parent / MASK
-    return distant_scene(
-        photos, _in_front(lights, rows.unit, posed_camera, source), posed_camera, mask, notes, dark=dark
-    )
+    lights = _in_front(lights, rows.unit, posed_camera, source)
+    return distant_scene(scene_photos(photos), lights, posed_camera, mask, notes, dark=dark)
 
 
 def _photos_of(folder: Path, source: Path) -> list[Path] | None:
@@ -123,7 +124,7 @@ def _photos_of(folder: Path, source: Path) -> list[Path] | None:
     for place in folders_of(folder):
         photos = photos_in(place)
         try:
-            posed_camera = picture_camera(photos[0])[0] if photos else None
+            posed_camera = picture_camera(photos)[0] if photos else None
             given = read_lights(source, [path.name for path in photos], posed_camera) if posed_camera else None
         except (CaptureError, NoMatchError):
             continue
@@ -167,24 +168,27 @@ def _in_front(lights: Sequence[Light], unit: str, posed_camera: PosedCamera, sou
     return found
 
 
-def _with_its_camera(photos: list[Path], own: Calibration, given: GivenLights, note: str) -> KnownScene:
+def _with_its_camera(photos: ScenePhotos, own: Calibration, given: GivenLights, note: str) -> KnownScene:
     """Return the scene with the camera, ground and unit of a calibration.json.
 
     Raises:
         CalibrationError: the photos are of another size.
     """
-    size, camera = read_size(photos[0]), own.camera
+    first, camera = photos.paths[0], own.camera
+    size = read_size(first)
     if size != (camera.width, camera.height):
         raise CalibrationError(
-            f"{photos[0]} is {size[0]} x {size[1]} pixels and the given calibration's camera {camera.width} x "
+            f"{first} is {size[0]} x {size[1]} pixels and the given calibration's camera {camera.width} x "
             f"{camera.height}; photos of that camera were needed. Give a list of lights without a camera."
         )
-    mask = photos[0].parent / MASK
+    mask = first.parent / MASK
     return KnownScene(
         replace(own, lights=given.lights, residuals={}),
-        tuple(photos),
+        tuple(photos.paths),
         None,
         mask if mask.is_file() else None,
         mask_is_grey=True,
         notes=(note, "camera and ground: from the same file"),
+        photos_left_out=photos.left_out,
+        every_photo=photos.every,
     )

@@ -29,6 +29,7 @@ from capture.decode.formats import read_size
 from capture.errors import CalibrationError
 from capture.files.arrays import read_npy
 from capture.files.json_field import JsonField, read_object
+from capture.session.scene_photos import scene_photos
 
 PARAMETERS, PHOTOS, SHADOWS, MASK = "params.json", "rgb", "visibility", "mask_obj.png"
 DIRECTIONS = "light_direction_sdps.npy"
@@ -64,7 +65,9 @@ class S3Nerf:
         document = JsonField(read_object(source, "K"), str(source))
         is_captured = "light_pos" not in document.value
         given = _captured(document, folder) if is_captured else _rendered(document)
-        photos, rows = _numbered(folder / PHOTOS, len(given.places), source)
+        found_photos, rows = _numbered(folder / PHOTOS, len(given.places), source)
+        usable = scene_photos(found_photos)
+        photos, rows = usable.paths, [rows[row] for row in usable.rows]
         size, camera = read_size(photos[0]), given.posed_camera.camera
         if size != (camera.width, camera.height):
             raise CalibrationError(
@@ -84,6 +87,8 @@ class S3Nerf:
             ground_known=found is not None,
             is_linear=True,
             notes=tuple(filter(None, (given.note, found, "photos: pixel values are linear, as in this layout"))),
+            photos_left_out=usable.left_out,
+            every_photo=usable.every,
         )
 
 

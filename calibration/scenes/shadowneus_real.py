@@ -20,6 +20,7 @@ from calibration.lights.power import with_common_power
 from capture.decode.formats import read_size
 from capture.errors import CalibrationError
 from capture.files.arrays import read_npz
+from capture.session.scene_photos import scene_photos
 
 PHOTOS, MASK = "image", "mask.png"
 ARRAYS = ("light_pose", "camera_pose", "camera_intrinsics", "floor_height")
@@ -62,6 +63,8 @@ class ShadowNeusReal:
                 f"{source}: light_pose gives {len(poses)} lights and {folder / PHOTOS} holds {len(photos)} photos; as "
                 "many were needed, in the same order."
             )
+        usable = scene_photos(photos)
+        photos, poses = usable.paths, poses[usable.rows]
         camera = _camera(content["camera_intrinsics"], read_size(photos[0]), source)
         low = [path.name for path, place in zip(photos, poses[:, 2, 3], strict=True) if place <= height]
         if pose.translation[2] <= height or low:
@@ -75,7 +78,13 @@ class ShadowNeusReal:
         if (folder / MASK).is_file():
             notes.append(f"{MASK}: not used, it marks all possible object pixels; the outline is found from the photos")
         return KnownScene(
-            with_common_power(calibration, preview(photos)), tuple(photos), None, None, notes=tuple(notes)
+            with_common_power(calibration, preview(photos)),
+            tuple(photos),
+            None,
+            None,
+            notes=tuple(notes),
+            photos_left_out=usable.left_out,
+            every_photo=usable.every,
         )
 
 

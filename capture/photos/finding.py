@@ -33,6 +33,10 @@ class Finding:
         """The photo's name; with its folder's, unless it is one under the flashlight."""
         return self.photo.name if self.role == "lit" else f"{self.photo.parent.name}/{self.photo.name}"
 
+    def row(self) -> dict[str, str]:
+        """Return the photo, its role and the reason, as a calibration's residuals list photos that are left out."""
+        return {"photo": self.photo.name, "role": self.role, "reason": f"{self.kind}: {self.text}"}
+
 
 def grouped(findings: Sequence[Finding]) -> str:
     """Return what is wrong with several photos in one sentence part; photos with one fault stand together."""

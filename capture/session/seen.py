@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,6 +19,7 @@ SAME_STEPS = (
     1.0  # of 255, root mean square: photos saved again, at quality 80 or half the size, differed by 0.2 to 0.6,
 )
 # those of six captures with the light in another place by 6 to 20
+Found = TypeVar("Found")
 
 
 class SeenPhotos:
@@ -52,10 +54,8 @@ class SeenPhotos:
         """Read the photos that are new or changed; return a finding for each of `paths` that cannot be read."""
         marks = {path: _mark(path) for path in paths}
         fresh = [path for path in paths if path not in self._known or self._known[path][0] != marks[path]]
-        with ThreadPoolExecutor(readers_at_once(_pixels(fresh[0]) if fresh else 1)) as readers:
-            for path, found in zip(fresh, readers.map(_features_or_fault, fresh), strict=True):
-                self._known[path] = (marks[path], found)
-        stop_decoders()
+        for path, found in zip(fresh, each_or_fault(features_of, fresh), strict=True):
+            self._known[path] = (marks[path], found)
         faults = {path: found for path in paths if isinstance(found := self._known[path][1], str)}
         return [Finding(path, "unreadable", text, 0.0, 0.0, True) for path, text in faults.items()]
 
@@ -74,7 +74,7 @@ class SeenPhotos:
         Returns:
             for each copy the photo that counts, and the root mean square of what they differ by, of 255.
         """
-        usual = usual_size([self[path] for path in paths])
+        usual = usual_size([self[path].size for path in paths])
         counts: list[Path] = []
         found: dict[Path, tuple[Path, float]] = {}
         for path in sorted(paths, key=lambda path: (self[path].size != usual, len(path.name))):
@@ -87,17 +87,24 @@ class SeenPhotos:
         return found
 
 
-def usual_size(photos: Sequence[PhotoFeatures]) -> tuple[int, int]:
+def usual_size(sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
     """Return the size of most photos."""
-    return Counter(photo.size for photo in photos).most_common(1)[0][0] if photos else (0, 0)
+    return Counter(sizes).most_common(1)[0][0] if sizes else (0, 0)
 
 
-def _features_or_fault(path: Path) -> PhotoFeatures | str:
-    """Return what is seen of a photo, or why it cannot be read, without its path."""
-    try:
-        return features_of(path)
-    except CaptureError as error:
-        return str(error).removeprefix(f"{path}").lstrip(" ,:")
+def each_or_fault(read: Callable[[Path], Found], paths: Sequence[Path]) -> list[Found | str]:
+    """Return what `read` returns of each photo, or why it cannot be read, without its path."""
+
+    def one(path: Path) -> Found | str:
+        try:
+            return read(path)
+        except CaptureError as error:
+            return str(error).removeprefix(f"{path}").lstrip(" ,:")
+
+    with ThreadPoolExecutor(readers_at_once(_pixels(paths[0]) if paths else 1)) as readers:
+        found = list(readers.map(one, paths))
+    stop_decoders()
+    return found
 
 
 def _mark(path: Path) -> tuple[int, int]:

@@ -109,12 +109,12 @@ def sorted_roles(
                 left_out = [one for one in left_out if one.photo != path]
         found = {role: [*found[role], *getattr(told, role)] for role in found}
     left_out = [_with_role(one, sound, found) for one in left_out]
-    size = usual_size([seen[path] for path in found["lit"]])
+    size = usual_size([seen[path].size for path in found["lit"]])
     for role in ("lit", "dark", "light"):
-        wanted = usual_size([seen[path] for path in found["light"]]) if role == "light" else size
+        wanted = usual_size([seen[path].size for path in found["light"]]) if role == "light" else size
         others = [path for path in found[role] if seen[path].size != wanted]
         found[role] = [path for path in found[role] if path not in others]
-        left_out += [_other_size(path, seen[path].size, wanted, role) for path in others]
+        left_out += [other_size(path, seen[path].size, wanted, role) for path in others]
     found |= {role: sorted(found[role], key=natural_order) for role in found if role != "board"}
     return Roles(**{field.name: tuple(found[field.name]) for field in fields(Roles)}), tuple(left_out)
 
@@ -157,7 +157,8 @@ def _with_role(one: Finding, sound: SoundPhotos, found: ByRole) -> Finding:
     return replace(one, role=one.role or next(iter(roles), "lit"))
 
 
-def _other_size(path: Path, size: tuple[int, int], wanted: tuple[int, int], role: str) -> Finding:
+def other_size(path: Path, size: tuple[int, int], wanted: tuple[int, int], role: str) -> Finding:
+    """Return the finding for a photo that has not the size of the others."""
     text = f"{size[0]} x {size[1]} pixels, the others are {wanted[0]} x {wanted[1]}: another lens, crop or orientation"
     return Finding(path, "another size", text, float(max(size)), float(max(wanted)), True, role=role)
 

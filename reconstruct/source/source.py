@@ -116,8 +116,10 @@ class Source:
         return self.known.rgb_paths or self.known.shadow_paths or ()
 
     def left_out(self) -> tuple[Finding, ...]:
-        """The photos of a capture that cannot be read, are copies, or have another size than the rest."""
-        sessions = () if self.capture is None else self.capture.sessions()
+        """The photos that cannot be read or have another size than the rest, and the copies of a capture's."""
+        if self.capture is None:
+            return () if self.known is None else self.known.photos_left_out
+        sessions = self.capture.sessions()
         return tuple(one for session in sessions for one in session.left_out)
 
 
