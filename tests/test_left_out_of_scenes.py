@@ -4,7 +4,15 @@ import json
 
 import numpy as np
 import pytest
-from dataset_folders import from_above, towards_lights, write_diligent, write_photo, write_rti
+from dataset_folders import (
+    from_above,
+    towards_lights,
+    write_diligent,
+    write_photo,
+    write_rti,
+    write_s3nerf,
+    write_shadowneus_real,
+)
 from PIL import Image
 from synthetic import BALL, Look, render
 
@@ -96,6 +104,44 @@ def test_too_few_good_photos_are_one_error_that_names_all_bad_ones(tmp_path, tru
     with pytest.raises(CaptureError, match=r"3 of 8 photos .* 4 are needed") as refused:
         open_source(tmp_path / "scene", RunOptions())
     assert all(path.name in str(refused.value) for path in paths[1:6])
+
+
+def ours(folder, truth):
+    rti(folder.with_name("theirs"), truth)
+    import_folder(folder.with_name("theirs"), "train", folder)
+    return folder / "photos"
+
+
+def s3nerf(folder, truth):
+    write_s3nerf(folder, truth)
+    return folder / "rgb"
+
+
+def shadowneus_real(folder, truth):
+    write_shadowneus_real(folder, truth)
+    return folder / "image"
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("layout", [ours, s3nerf, shadowneus_real])
+def test_lights_with_a_camera_stay_with_their_photos(tmp_path, truth, layout, fault):
+    if layout is not ours:
+        truth = render((BALL,), Look(width=SIDE, height=SIDE, n_lights=PHOTOS), from_above(SIDE))[1]
+    paths = photos_of(layout(tmp_path / "scene", truth))
+    whole = open_source(tmp_path / "scene", RunOptions()).known
+    FAULTS[fault][0](paths[0])
+    source = open_source(tmp_path / "scene", RunOptions())
+    assert whole is not None and source.known is not None
+    assert [(one.photo, one.kind) for one in source.left_out()] == [(paths[0], FAULTS[fault][1])]
+    before, after = (
+        {light.photo: light.homogeneous() for light in scene.calibration.lights} for scene in (whole, source.known)
+    )
+    assert list(after) == [path.name for path in paths[1:]]
+    turns = [np.array(list(after.values()))[:, :3], np.array([before[name] for name in after])[:, :3]]
+    apart = [np.linalg.norm(one[:, None] - one[None], axis=-1) for one in turns]  # another frame keeps distances
+    assert apart[0] == pytest.approx(apart[1], rel=0.05, abs=1e-3)
+    stack = read_photos(source, RunOptions()).stack
+    assert stack is not None and list(stack.paths) == paths[1:]
 
 
 @pytest.mark.parametrize("layout", [rti, diligent])

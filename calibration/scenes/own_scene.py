@@ -6,6 +6,7 @@
 """
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,7 @@ from capture.files.atomic import atomic_folder, write_json
 from capture.files.json_field import JsonField, read_object
 from capture.files.names import inside
 from capture.photos.photo import read_alpha, read_grey
+from capture.session.scene_photos import scene_photos
 
 FORMAT = 1
 MARKER, CALIBRATION, PHOTOS, SHADOWS, MASK = "import.json", "calibration.json", "photos", "shadows", "mask.png"
@@ -34,7 +36,7 @@ class OwnScene:
         return MARKER if (folder / MARKER).is_file() else None
 
     def load(self, folder: Path, split: str) -> KnownScene:
-        """Load the imported scene unchanged.
+        """Load the imported scene, without photos that cannot be used.
 
         Raises:
             CalibrationError, CaptureError: a file or entry is missing or impossible; the message names both.
@@ -53,17 +55,21 @@ class OwnScene:
         )
         if rgb is None and shadows is None:
             raise CalibrationError(f"{source}: neither '{PHOTOS}' nor '{SHADOWS}' is true; one of them was needed.")
+        usable = scene_photos(rgb or shadows or ())
+        kept = {names[row] for row in usable.rows}
         mask = folder / MASK
         return KnownScene(
-            calibration,
-            rgb,
-            shadows,
+            replace(calibration, lights=tuple(light for light in calibration.lights if light.photo in kept)),
+            rgb and tuple(rgb[row] for row in usable.rows),
+            shadows and tuple(shadows[row] for row in usable.rows),
             mask if mask.is_file() else None,
             mask_is_grey=True,
             ground_known=document["ground_known"].flag(),
             is_linear=document["linear"].flag(),
             dark_paths=tuple(photos_in(folder / DARK)),
             notes=tuple(note.text() for note in document["notes"].entries()),
+            photos_left_out=usable.left_out,
+            every_photo=tuple(names),
         )
 
 
