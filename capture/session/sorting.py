@@ -73,8 +73,8 @@ def sound_photos(stored: ByRole, named: ByRole, seen: SeenPhotos) -> SoundPhotos
     good = [path for path in role_of if path not in bad]
     left_out, again = list(unreadable), []
     for path, (other, off) in seen.copies(good).items():
-        if role_of[path] == "dark" and role_of[other] == "dark" and off > 0:
-            continue  # without the flashlight all photos show the same
+        if "dark" in (role_of[path], role_of[other]) and off > 0:
+            continue  # without the flashlight all photos show the same, also one under a flashlight that did not fire
         where = other.name if other.parent == path.parent else f"{other.parent.name}/{other.name}"
         text = f"the same picture as {where}: brightness differs by {off:.1f} of 255 steps, {SAME_STEPS:g} was needed"
         left_out.append(Finding(path, "copy", text, off, SAME_STEPS, True, role=role_of[path]))
