@@ -111,8 +111,8 @@ def open_subject(named: str, kind: str = "auto", preset: str = "standard") -> Su
         folder = ROOT / place
     source = open_source(folder, options)
     pictures = read_photos(source, options)
-    calibration = calibrate_source(source, pictures, options)
-    return Subject(folder.name, pictures, calibration, folder, None, source.ground_is_known(options))
+    calibration = calibrate_source(source, pictures, options).first
+    return Subject(folder.name, pictures[0], calibration, folder, None, source.ground_is_known(options))
 
 
 def synthetic(kind: str, shapes: tuple = HEAP, look: Look = LOOK) -> Subject:

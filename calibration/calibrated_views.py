@@ -62,9 +62,9 @@ class CalibratedViews:
         return replace(self, views=tuple(replace(view, calibration=one) for view, one in pairs))
 
     @staticmethod
-    def of(calibration: Calibration) -> "CalibratedViews":
+    def of(calibration: Calibration, name: str = "") -> "CalibratedViews":
         """Return the views of a capture of one view."""
-        return CalibratedViews((CalibratedView("", calibration),))
+        return CalibratedViews((CalibratedView(name, calibration),))
 
 
 def save_views(views: CalibratedViews, path: Path) -> None:

@@ -133,7 +133,7 @@ def test_frames_run_through_manifest_thumbnails_and_resuming_like_photos(tmp_pat
     (tmp_path / "capture" / "session.toml").write_text("clip_frames = 6\n")
     options = RunOptions()
     source = open_source(tmp_path / "capture", options)
-    pictures = read_photos(source, options)
+    pictures = read_photos(source, options)[0]
     for again in (source, open_source(tmp_path / "capture", options)):  # of a continued run other frames are refused
         with RunFolder(tmp_path / "run") as run:
             claim(again, options, run, "calibrate", force=False)

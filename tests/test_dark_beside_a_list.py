@@ -50,14 +50,14 @@ def test_photos_without_light_are_subtracted(tmp_path, layout):
         write_photo(dark / f"{name}.png", ROOM, curve)
     options = RunOptions()
     source = open_source(tmp_path / "theirs", options)
-    stack = read_photos(source, options).stack
+    stack = read_photos(source, options)[0].stack
     assert stack is not None and np.abs(stack.rgb - clean).max() < 0.01
     assert {dark / "a.png", dark / "b.png"} <= set(source.files(options))
     assert source.known is not None and any(
         "the mean of dark/ (2) is subtracted" in note for note in source.known.notes
     )
     import_folder(tmp_path / "theirs", "train", tmp_path / "ours")
-    again = read_photos(open_source(tmp_path / "ours", options), options).stack
+    again = read_photos(open_source(tmp_path / "ours", options), options)[0].stack
     assert again is not None and np.array_equal(again.rgb, stack.rgb)
 
 

@@ -46,12 +46,12 @@ def test_the_camera_looks_straight_down_and_lights_stay_where_they_are(tmp_path)
 
 def test_shadow_pictures_stay_grey_and_the_silhouette_is_the_mask_unless_left_out(tmp_path):
     write_scene(tmp_path)
-    pictures = read_photos(open_source(tmp_path, RunOptions(input="shadow")), RunOptions(input="shadow"))
+    pictures = read_photos(open_source(tmp_path, RunOptions(input="shadow")), RunOptions(input="shadow"))[0]
     assert pictures.stack is None and pictures.shadow is not None and pictures.mask is not None
     assert pictures.shadow[:, 0, 0] == pytest.approx(np.array([40, 80, 120]) / 255)
     assert pictures.mask.mean() == 0.5
     without = RunOptions(mask="none")
-    assert read_photos(open_source(tmp_path, without), without).mask is None
+    assert read_photos(open_source(tmp_path, without), without)[0].mask is None
 
 
 def test_a_silhouette_without_background_says_nothing(tmp_path):
@@ -63,7 +63,7 @@ def test_an_unknown_ground_is_an_assumption_that_the_result_names(tmp_path):
     write_scene(tmp_path)
     options = RunOptions()
     source = open_source(tmp_path, options)
-    calibration = calibrate_source(source, read_photos(source, options), options)
+    calibration = calibrate_source(source, read_photos(source, options), options).first
     assert not source.ground_is_known(options)
     assert "ground is unknown" in calibration.residuals["warnings"][-1]
     assert "assumed" in calibration.residuals["warnings"][-1]
@@ -73,7 +73,7 @@ def test_a_given_height_is_the_ground(tmp_path):
     write_scene(tmp_path)
     options = RunOptions(ground="-2.5")
     source = open_source(tmp_path, options)
-    calibration = calibrate_source(source, read_photos(source, options), options)
+    calibration = calibrate_source(source, read_photos(source, options), options).first
     assert source.ground_is_known(options) and calibration.ground_height == -2.5
     assert "warnings" not in calibration.residuals
 

@@ -181,7 +181,7 @@ def test_the_stage_leaves_a_detail_and_is_done_once(ball, tmp_path):
         photos = read_photos(source, options)
 
         def write() -> None:
-            write_detail(source, options, run, (photos,), CalibratedViews.of(ball.calibration), ball.fields)
+            write_detail(source, options, run, photos, CalibratedViews.of(ball.calibration), ball.fields)
 
         assert done_once(run, "detail", "reading", write)
         assert not done_once(run, "detail", "reading", write)
@@ -205,7 +205,7 @@ def test_reduced_photos_that_the_run_keeps_are_not_decoded_again(ball, tmp_path,
         monkeypatch.setattr(capture.photos.photo, "_read_reduced", None)
         again = read_photos(source, options, run.file(KEPT))
         monkeypatch.setattr(detail_photos, "read_photo", counted)
-        write_detail(source, options, run, (again,), CalibratedViews.of(ball.calibration), ball.fields)
+        write_detail(source, options, run, again, CalibratedViews.of(ball.calibration), ball.fields)
         assert whole == list(ball.paths) and run.file(DETAIL).exists()
 
 
@@ -410,7 +410,7 @@ def test_the_stage_reads_every_view_and_says_which(both, ball, turned, tmp_path,
         for name, one in (("view_1", ball), ("turned_1", turned[0]))
     ]
     options = RunOptions(detail="on")
-    photos = tuple(read_photos(replace(one, capture=None), options) for one in sources)
+    photos = tuple(replace(read_photos(replace(one, capture=None), options)[0], view=one.name) for one in sources)
     monkeypatch.setattr(Source, "views", lambda _: tuple(sources))
     monkeypatch.setattr(Source, "session", None)
     with RunFolder(tmp_path / "run") as run:

@@ -108,7 +108,7 @@ def test_two_valued_grey_pictures_are_shadows_and_no_colour(tmp_path):
 def test_the_pictures_that_were_asked_for_are_read(tmp_path, wanted, colour, shadow):
     truth = write_scene(tmp_path, light_type="point")
     options = RunOptions(input=wanted)
-    pictures = read_photos(open_source(tmp_path, options), options)
+    pictures = read_photos(open_source(tmp_path, options), options)[0]
     assert (pictures.stack is not None, pictures.shadow is not None) == (colour, shadow)
     if pictures.shadow is not None:
         assert np.array_equal(pictures.shadow, truth.visibility)

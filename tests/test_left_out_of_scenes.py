@@ -83,8 +83,9 @@ def test_a_bad_photo_is_left_out_with_its_light(tmp_path, truth, layout, fault, 
     options = RunOptions()
     source = open_source(tmp_path / "scene", options)
     photos = read_photos(source, options)
-    assert photos.stack is not None and list(photos.stack.paths) == good
-    calibration = calibrate_source(source, photos, options)
+    stack = photos[0].stack
+    assert stack is not None and list(stack.paths) == good
+    calibration = calibrate_source(source, photos, options).first
     assert [light.photo for light in calibration.lights] == [path.name for path in good]
     wanted = np.delete(towards_lights(truth), index, axis=0)
     found = np.array([light.direction for light in calibration.lights])
@@ -140,7 +141,7 @@ def test_lights_with_a_camera_stay_with_their_photos(tmp_path, truth, layout, fa
     turns = [np.array(list(after.values()))[:, :3], np.array([before[name] for name in after])[:, :3]]
     apart = [np.linalg.norm(one[:, None] - one[None], axis=-1) for one in turns]  # another frame keeps distances
     assert apart[0] == pytest.approx(apart[1], rel=0.05, abs=1e-3)
-    stack = read_photos(source, RunOptions()).stack
+    stack = read_photos(source, RunOptions())[0].stack
     assert stack is not None and list(stack.paths) == paths[1:]
 
 
@@ -152,7 +153,7 @@ def test_another_list_by_order_counts_the_photos_that_were_left_out(tmp_path, tr
     np.savetxt(given, towards_lights(truth), fmt="%.6f", header=str(PHOTOS), comments="")
     options = RunOptions(lights=str(given))
     source = open_source(tmp_path / "scene", options)
-    lights = calibrate_source(source, read_photos(source, options), options).lights
+    lights = calibrate_source(source, read_photos(source, options), options).first.lights
     wanted = np.delete(towards_lights(truth), 2, axis=0)
     assert np.abs(np.array([light.direction for light in lights]) - wanted).max() < 1e-3
 

@@ -247,9 +247,10 @@ def test_a_stated_light_error_makes_known_lights_uncertain(tmp_path):
     write_scene(tmp_path / "scene", light_type="point")
     options = RunOptions(light_error=0.03)
     source = open_source(tmp_path / "scene", options)
-    calibration = calibrate_source(source, read_photos(source, options), options)
+    calibration = calibrate_source(source, read_photos(source, options), options).first
     for light in calibration.lights:
-        distance = np.linalg.norm(light.position - [0, 0, 0])  # the camera looks at the ground 15 mm beside the origin
+        assert light.position is not None
+        distance = np.linalg.norm(light.position)  # the camera looks at the ground 15 mm beside the origin
         assert np.linalg.norm(light.sigma) == pytest.approx(0.03 * distance, rel=0.05)
     with pytest.raises(CaptureError, match="--light-error 3"):
         open_source(tmp_path / "scene", RunOptions(light_error=3.0))

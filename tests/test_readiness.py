@@ -271,9 +271,9 @@ def test_the_command_leaves_page_and_json_and_refuses_the_hopeless(truth, cover,
 def test_photos_without_any_usable_light_are_refused_with_the_first_reasons(truth, monkeypatch):
     unused = tuple(replace(x, used=False, reason="camera moved: 9 px") for x in truth.calibration.lights)
     pictures = Photos(truth.stack)
-    monkeypatch.setattr(readiness, "read_views", lambda source, options: (pictures,))
+    monkeypatch.setattr(readiness, "read_photos", lambda source, options: (pictures,))
     monkeypatch.setattr(
-        readiness, "calibrate_source_views", lambda *_: CalibratedViews.of(replace(truth.calibration, lights=unused))
+        readiness, "calibrate_source", lambda *_: CalibratedViews.of(replace(truth.calibration, lights=unused))
     )
     with pytest.raises(CalibrationError, match=r"0 of 26 photos in heap have a usable light, .*: camera moved: 9 px"):
         readiness.read_and_check(Source(Path("heap")), RunOptions())
@@ -286,7 +286,7 @@ def test_a_failed_calibration_also_says_what_is_wrong_with_the_photos(truth, mon
         raise CalibrationError("no board found.")
 
     pictures = Photos(truth.stack, (finding,))
-    monkeypatch.setattr(readiness, "read_views", lambda source, options: (pictures,))
-    monkeypatch.setattr(readiness, "calibrate_source_views", fail)
+    monkeypatch.setattr(readiness, "read_photos", lambda source, options: (pictures,))
+    monkeypatch.setattr(readiness, "calibrate_source", fail)
     with pytest.raises(CalibrationError, match=r"no board found\. Besides: IMG_3\.jpg: blurred\."):
         readiness.read_and_check(Source(Path("heap")), RunOptions())

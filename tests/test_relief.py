@@ -132,11 +132,11 @@ def test_the_depth_of_the_ground_comes_back_as_written(tmp_path, kind):
     depth[0, 0] = 1e10  # nothing there
     path = write_floor(tmp_path, depth, f"r_000_depth_0001.{kind}")
     source = open_source(tmp_path, RunOptions())
-    read = read_photos(source, RunOptions()).ground_depth
+    read = read_photos(source, RunOptions())[0].ground_depth
     assert path in source.files(RunOptions())
     assert read is not None and np.isnan(read[0, 0])
     assert np.allclose(read.ravel()[1:], depth.ravel()[1:], rtol=1e-6)
-    assert read_photos(source, RunOptions(ground="0")).ground_depth is None  # a plane was asked for
+    assert read_photos(source, RunOptions(ground="0"))[0].ground_depth is None  # a plane was asked for
 
 
 def test_a_depth_map_of_another_size_or_without_ground_is_refused(tmp_path):

@@ -11,9 +11,9 @@ import pytest
 from calibration.calibrated_views import load_views, save_views
 from examples.generator.options import Around, Exposure, Flashlight, Further, Phone, Setup, Table, Thing
 from reconstruct.check.verdict import check_capture
-from reconstruct.source.calibrate_source import calibrate_source_views
+from reconstruct.source.calibrate_source import calibrate_source
 from reconstruct.source.options import RunOptions
-from reconstruct.source.photos import Photos, read_views
+from reconstruct.source.photos import read_photos
 from reconstruct.source.source import open_source
 
 DRAFT = RunOptions(preset="draft")
@@ -45,8 +45,8 @@ def capture(tmp_path_factory):
 
 def calibrated(folder):
     source = open_source(folder, DRAFT)
-    photos = read_views(source, DRAFT)
-    return source, photos, calibrate_source_views(source, photos, DRAFT)
+    photos = read_photos(source, DRAFT)
+    return source, photos, calibrate_source(source, photos, DRAFT)
 
 
 def test_views_and_a_lie_are_calibrated_in_their_boards_frames_and_a_pushed_tripod_is_named(capture, tmp_path):
@@ -59,8 +59,8 @@ def test_views_and_a_lie_are_calibrated_in_their_boards_frames_and_a_pushed_trip
         assert np.linalg.norm(off) < 4.0, view.name  # of 520 mm, with pictures of 400 px
         lights = json.loads((capture / "gt" / view.name / "lights.json").read_text())["photos"]
         assert [light.photo for light in view.calibration.lights] == [light["file"] for light in lights]
-    assert all(isinstance(one, Photos) for one in photos)
-    pushed = [f.photo.name for one in photos if isinstance(one, Photos) for f in one.findings if f.drop]
+    assert all(one.error is None for one in photos)
+    pushed = [f.photo.name for one in photos for f in one.findings if f.drop]
     assert pushed == ["IMG_0603.jpg"]
     checked = check_capture(source, photos, views)
     assert len(checked.further) == 2 and set(checked.readiness.facts["views"]) == {"view_1", "view_2", "view_3"}

@@ -72,14 +72,15 @@ def test_photos_with_a_ball_need_neither_board_nor_list(tmp_path, photographed, 
     options = RunOptions()
     source = open_source(tmp_path, options)
     photos = read_photos(source, options)
-    calibration = calibrate_source(source, photos, options)
+    calibration = calibrate_source(source, photos, options).first
     found = np.array([light.direction for light in calibration.lights])
     off = np.arccos(np.clip((found * towards_lights(photographed)).sum(-1), -1, 1))
     sigma = np.array([light.sigma[0] for light in calibration.lights])
     assert all(light.used for light in calibration.lights) and (off < 2 * np.sqrt(2) * sigma).all()
     assert np.degrees(off).max() < 5  # half a pixel on a ball of 22 px is 2.6 degrees
     assert any("shiny ball" in note for note in calibration.residuals["notes"])
-    assert photos.mask is not None and photos.mask[int(BALL.y), int(BALL.x)] == 0 and photos.mask[150, 100] == 1
+    mask = photos[0].mask
+    assert mask is not None and mask[int(BALL.y), int(BALL.x)] == 0 and mask[150, 100] == 1
 
 
 def test_without_ball_board_and_list_it_is_said_what_would_do(tmp_path, photographed):

@@ -15,7 +15,7 @@ from reconstruct.run.report_json import _requests
 from reconstruct.run.request_steering import RequestSteering
 from reconstruct.run_folder.folder import RunFolder, read_log
 from reconstruct.run_folder.requests import ON_REQUEST, PAUSED, REQUESTS, make_request, open_requests, withdraw
-from reconstruct.solve.solver import NO_STEERING, fit
+from reconstruct.solve.solver import NO_STEERING, fit_steered
 from reconstruct.solve.steering import Rescheduled
 
 pytestmark = pytest.mark.usefixtures("hull_start")
@@ -48,7 +48,7 @@ def solve(scene, config, run, asked, checkpoint=None, earlier=None):
             for name in asked.get(done, ()) if stage == "solve" else ():
                 make_request(run.path, name)
 
-    return fit(scene, config, report, checkpoint, None, steering, earlier), seen, steering
+    return fit_steered(scene, config, report, checkpoint, None, steering, earlier), seen, steering
 
 
 def end_pause(run_dir) -> None:
@@ -102,13 +102,13 @@ def test_a_level_ends_at_its_next_rest_and_the_next_one_is_done_whole(tmp_path, 
 
 def test_another_resolution_begins_with_the_next_level_and_is_the_same_whenever_it_is_resumed(tmp_path, scene):
     with RunFolder(tmp_path) as run:
-        with pytest.raises(Rescheduled) as change:
-            solve(scene, SMALL, run, {3: ["draft"], 4: ["fine"]})
-        assert (change.value.resolution, change.value.config, change.value.state.level) == ("fine", FINER, 1)
+        change, _, _ = solve(scene, SMALL, run, {3: ["draft"], 4: ["fine"]})
+        assert isinstance(change, Rescheduled)
+        assert (change.resolution, change.config, change.state.level) == ("fine", FINER, 1)
         assert f"{ON_REQUEST}going on as fine after round 1" in messages(run)
-    once, seen, _ = solve(scene, FINER, None, {}, earlier=change.value.state)
+    once, seen, _ = solve(scene, FINER, None, {}, earlier=change.state)
     assert seen[0] == ("solve", 21) and seen[-1] == ("solve", 30)
-    again, _, _ = solve(scene, FINER, None, {}, earlier=change.value.state)
+    again, _, _ = solve(scene, FINER, None, {}, earlier=change.state)
     assert torch.equal(once.grid.values, again.grid.values)
 
 

@@ -94,7 +94,7 @@ def photographed(phones, place: Path, folder: Path) -> None:
 def calibrated(folder: Path) -> Calibration:
     options = RunOptions(preset="draft", board=BOARD)
     source = open_source(folder, options)
-    return calibrate_source(source, read_photos(source, options), options)
+    return calibrate_source(source, read_photos(source, options), options).first
 
 
 def small(file: Path) -> np.ndarray:

@@ -113,7 +113,7 @@ def _outcome(case: Case, source: Original, with_lights: bool) -> Outcome:
             checked = read_and_check(opened, options)
             judged = _judged(case, names, checked.findings, checked.calibration.lights)
         else:
-            judged = _judged(case, names, read_photos(opened, options).findings, ())
+            judged = _judged(case, names, read_photos(opened, options)[0].findings, ())
     except UserError as error:
         judged = False, False, 0, f"refused: {error}"
     finally:

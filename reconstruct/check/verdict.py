@@ -23,9 +23,9 @@ from reconstruct.check.light_coverage import LONG_SIDE, ShadowCover, directions,
 from reconstruct.check.readiness import POWER_CHANGED, Readiness, judge, powers_mean_nothing, usual_log
 from reconstruct.check.without_ground import judge_without_ground
 from reconstruct.scene import build_scene
-from reconstruct.source.calibrate_source import calibrate_source_views
+from reconstruct.source.calibrate_source import calibrate_source
 from reconstruct.source.options import RunOptions
-from reconstruct.source.photos import Photos, read_views
+from reconstruct.source.photos import Photos, read_photos
 from reconstruct.source.source import Source
 
 POWER_SIGMAS = 2.0  # standard deviations of a power whose light's distance is uncertain
@@ -67,28 +67,25 @@ def read_and_check(source: Source, options: RunOptions) -> CaptureCheck:
     Raises:
         CaptureError, CalibrationError: no photos, or the board, the ground or the lights cannot be found.
     """
-    photos = [  # the capture is judged, not this machine's memory
-        replace(one, plan=None) if isinstance(one, Photos) else one for one in read_views(source, options)
-    ]
-    if all(isinstance(one, Photos) and one.stack is None for one in photos):
+    photos = [replace(one, plan=None) for one in read_photos(source, options)]  # the capture is judged, not the memory
+    if all(one.error is None and one.stack is None for one in photos):
         raise CaptureError(
             f"{source.folder} holds shadow pictures only, and `check` looks at photos. Run it as it is: "
             "shadow pictures need no check."
         )
     try:
-        views = calibrate_source_views(source, photos, options)
+        views = calibrate_source(source, photos, options)
     except CalibrationError as error:
-        known = [one for one in photos if isinstance(one, Photos)]
-        faults = "; ".join(f"{finding.photo.name}: {finding.kind}" for one in known for finding in one.findings)
+        faults = "; ".join(f"{finding.photo.name}: {finding.kind}" for one in photos for finding in one.findings)
         raise CalibrationError(f"{error}" + (f" Besides: {faults}." if faults else "")) from error
     if not source.ground_is_known(options):
-        return _check_without_ground(source, photos[0], views.views[0].calibration)
+        return _check_without_ground(source, photos[0], views.first)
     return check_capture(source, photos, views)
 
 
-def _check_without_ground(source: Source, photos: Photos | CaptureError, calibration: Calibration) -> CaptureCheck:
+def _check_without_ground(source: Source, photos: Photos, calibration: Calibration) -> CaptureCheck:
     """Judge photos under known lights by the object's shading."""
-    assert isinstance(photos, Photos) and photos.stack is not None, "others are refused before"
+    assert photos.stack is not None, "others are refused before"
     scene = replace(build_scene(photos.stack, calibration, LONG_SIDE, mask=photos.mask), ground_known=False)
     readiness, cover = judge_without_ground(scene, calibration, photos.findings)
     notes = tuple(map(str, calibration.residuals.get("notes", [])))
@@ -96,34 +93,24 @@ def _check_without_ground(source: Source, photos: Photos | CaptureError, calibra
     return CaptureCheck(name, readiness, calibration, photos.findings, cover, notes)
 
 
-def check_capture(
-    source: Source,
-    photos: Photos | Sequence[Photos | CaptureError],
-    calibration: Calibration | CalibratedViews,
-) -> CaptureCheck:
-    """Judge a capture before it is reconstructed: the views of a capture of several each, and then together.
+def check_capture(source: Source, photos: Sequence[Photos], calibrated: CalibratedViews) -> CaptureCheck:
+    """Judge a capture before it is reconstructed: each of its views, and then several together.
 
     Args:
-        photos: with a stack of colour photos; of several views as read_views reads them.
-        calibration: of these photos, with a known ground.
+        photos: with a stack of colour photos, as read_photos reads them.
+        calibrated: of these photos, with a known ground.
 
     Raises:
         CalibrationError: no photo has a usable light.
     """
-    views = CalibratedViews.of(calibration) if isinstance(calibration, Calibration) else calibration
-    every = (photos,) if isinstance(photos, Photos) else photos
-    named = {
-        one.capture.name if one.capture else "": (one, own) for one, own in zip(source.views(), every, strict=True)
-    }
+    sources, by_name = {one.name: one for one in source.views()}, {one.view: one for one in photos}
     found = []
-    for view in views.views:
-        own = named[view.name][1]
-        assert isinstance(own, Photos), "a view whose photos cannot be read has no calibration"
-        one = _check_view(named[view.name][0], own, view.calibration, len(named) > 1)
+    for view in calibrated.views:
+        one = _check_view(sources[view.name], by_name[view.name], view.calibration, len(sources) > 1)
         found.append(replace(one, name=view.name or one.name))
-    if len(named) == 1:
+    if len(sources) == 1:
         return found[0]
-    readiness = judge_together(views, [one.readiness for one in found], [one.cover for one in found])
+    readiness = judge_together(calibrated, [one.readiness for one in found], [one.cover for one in found])
     return replace(found[0], name=title_of(source.folder), readiness=readiness, further=tuple(found[1:]))
 
 

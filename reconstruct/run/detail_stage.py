@@ -10,7 +10,7 @@ from reconstruct.detail.file import DETAIL, Detail, save_details
 from reconstruct.detail.full_photos import full_photos
 from reconstruct.fields import Fields
 from reconstruct.labels.multiple_lights import is_shared
-from reconstruct.run.solve_stage import AllPhotos, seen_views
+from reconstruct.run.solve_stage import seen_views
 from reconstruct.run_folder.folder import RunFolder
 from reconstruct.scene import build_scene
 from reconstruct.source.options import LONG_SIDES, RunOptions
@@ -33,24 +33,24 @@ def write_detail(
     source: Source,
     options: RunOptions,
     run: RunFolder,
-    photos: AllPhotos,
+    photos: Sequence[Photos],
     calibrated: CalibratedViews,
     fields: Fields,
 ) -> None:
     """Write detail.safetensors, the detail of each view that has one; log the reason where a view has none.
 
     Args:
-        photos: as read_views reads them, in the order of source.views().
+        photos: as read_photos reads them.
 
     Raises:
         CaptureError: a photo can no longer be read.
     """
-    sources = {"" if own.capture is None else own.capture.name: own for own in source.views()}
-    seen = [view for lie in (calibrated, *calibrated.lies) for view in seen_views(source, photos, lie)]
-    by_name = {name: (photos, calibration) for name, photos, calibration in seen}
+    sources = {own.name: own for own in source.views()}
+    seen = [own for lie in (calibrated, *calibrated.lies) for own in seen_views(photos, lie)]
+    by_name = {own[0].view: own for own in seen}
     views, details = fields.views(), []
     for number, view in enumerate(views):
-        own = by_name.get(view.view, seen[0][1:] if number == 0 else None)
+        own = by_name.get(view.view, seen[0] if number == 0 else None)
         if own is not None:
             found = _of_view(sources.get(view.view, source), options, run, own, view, _reporter(run, number, views))
             details += [] if found is None else [replace(found, view=number, object_from_world=view.object_from_world)]

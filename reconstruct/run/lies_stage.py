@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 
 from capture.errors import ReconstructionError
+from reconstruct.config import FitConfig
 from reconstruct.fields import Fields, load_fields, save_fields
 from reconstruct.lies.confirmed import confirmed, withheld
 from reconstruct.lies.together import PlacedLie, SolvedLie, Together, lay_together
@@ -15,6 +16,7 @@ from reconstruct.run.presets import preset
 from reconstruct.run_folder.folder import RunFolder
 from reconstruct.scene import reduced
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.solve.checkpoint import SolveState
 from reconstruct.solve.solver import SolveReporter, begun, fit, fit_surface
 from reconstruct.source.options import LONG_SIDES
 from reconstruct.views import Scenes
@@ -24,6 +26,22 @@ KEPT_LIE = "checkpoint_lie"  # file of a lie's own solve, while the run needs it
 NOT_JOINED = "mesh.ply"  # of a lie that could not be laid on the others, in a folder of its name
 
 Lies = tuple[tuple[str, Scenes], ...]  # name and scenes of each further lie, in its own world
+
+
+def joined_lies(
+    scenes: Scenes, lies: Lies, config: FitConfig, run: RunFolder, report: SolveReporter, device: torch.device | None
+) -> tuple[Scenes, SolveState | None, tuple[str, ...]]:
+    """Return the scenes of all lies that can be laid together, the state that their solve begins with, and doubts.
+
+    Raises:
+        ReconstructionError: the first lie cannot be solved.
+    """
+    if not (lies and scenes[0].ground_known):
+        return scenes, None, ()
+    together = lay_lies_together(scenes, lies, config.seed, run, report, device)
+    scenes, doubts = joined_scenes(scenes, lies, together.placed), tuple(text for _, text in together.refused)
+    start = begun(together.start, min(1, len(config.levels) - 1), scenes) if together.placed else None
+    return scenes, start, doubts
 
 
 def lay_lies_together(

@@ -3,22 +3,24 @@
 Eight functions, in this order. Each depends on its arguments alone; examples/step_by_step.py calls them one by one.
 
     open_source       a folder            -> Source: a capture, or a scene that comes with its lights
-    read_photos       Source              -> Photos: linear; bad ones named; room light and white balance divided out
-    calibrate_source  Photos              -> Calibration: camera, ground, a light per photo, each with its sigma
+    read_photos       Source              -> Photos of each view: linear, bad ones named, room light divided out
+    calibrate_source  Photos              -> CalibratedViews: camera, ground, a light per photo, each with its sigma
     check_capture     Photos, Calibration -> CaptureCheck: a verdict; a hopeless capture ends here
-    prepare_scene     Photos, Calibration -> Scene: torch tensors at the preset's size
-    fit               Scene               -> Fields: signed distances and materials
+    prepare_scene     Photos, Calibration -> a Scene of each view: torch tensors at the preset's size
+    fit               Scenes              -> Fields: signed distances and materials
     extract_mesh      Fields              -> a closed mesh in the world frame
     save_results      mesh, Fields        -> files for people and other programs
+
+A capture of one view is a tuple of one.
 
 A stage that an earlier invocation finished is not repeated: its result is read back if a later stage needs it.
 """
 
 import platform
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict, fields
 
-import trimesh
 from PIL import Image
 
 from calibration.calibrated_views import CalibratedViews, load_views, save_views
@@ -35,17 +37,17 @@ from reconstruct.run.detail_stage import detail_is_asked, write_detail
 from reconstruct.run.machine import kernels_are_compiled, measure_speed, planned_seconds, whole_seconds, work_of
 from reconstruct.run.presets import solver_config
 from reconstruct.run.report_json import summary, versions
-from reconstruct.run.results import save_results, save_views_maps
-from reconstruct.run.solve_stage import AllPhotos, solve
+from reconstruct.run.results import save_results
+from reconstruct.run.solve_stage import solve
 from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder, content_hash
 from reconstruct.run_folder.forecast import duration_text, plan_numbers
 from reconstruct.run_folder.once import Lazy, ResultFile, done_once, once
 from reconstruct.run_folder.progress import told
 from reconstruct.solve.backend import backend_name, solver_device
-from reconstruct.source.calibrate_source import calibrate_source_views
+from reconstruct.source.calibrate_source import calibrate_source
 from reconstruct.source.memory import Plan, keep_spread, read_plan
 from reconstruct.source.options import RunOptions
-from reconstruct.source.photos import memory_plan, read_views
+from reconstruct.source.photos import Photos, memory_plan, read_photos
 from reconstruct.source.scale import in_millimetres, with_scale_of
 from reconstruct.source.source import Source
 from reconstruct.stored_run.maps import THUMBS, thumbnail_name
@@ -77,16 +79,38 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
         run.progress("capture", message=f"forgotten, as the run starts anew: {', '.join(sorted(run.forgotten))}")
     _plan_time(source, options, run, stages)
     photos = Lazy(lambda: _read(source, options, run))
-    calibration = once(
+    calibrated = once(
         run,
         "calibrate",
         "finding camera, ground and lights",
         lambda: _calibrated(source, photos.get(), options, run),
         CALIBRATION,
-        needs=photos,
+        photos,
     )
-    if stages != "calibrate":
-        _reconstruct(source, options, run, photos, calibration)
+    if stages == "calibrate":
+        return
+    if source.session is not None and source.ground_is_known(options) and not run.is_finished("solve"):
+        done_once(
+            run, "check", "judging the photos", lambda: _check(source, photos.get(), calibrated.get(), run), photos
+        )
+    fields = once(
+        run, "solve", _fitting(options), lambda: _solved(source, photos, calibrated.get(), options, run), FIELDS, photos
+    )
+    if source.scale(options) is not None and run.is_finished("solve"):
+        _keep_scale(source, options, run, calibrated.get(), fields.get())
+    calibrated.forget()  # the memory plan may have left out photos
+    mesh = Lazy(lambda: extract_mesh(fields.get()))
+    is_new = done_once(
+        run, "mesh", "making the mesh", lambda: save_results(mesh.get(), fields.get(), calibrated.get(), run.path)
+    )
+    if detail_is_asked(source, options):
+        message = "reading relief and colours from the whole photos"
+        do = lambda: write_detail(source, options, run, photos.get(), calibrated.get(), fields.get())  # noqa: E731
+        is_new |= done_once(run, "detail", message, do, photos)
+    if run.is_finished("solve"):  # a visitor of the page may have stopped it: then the same command goes on
+        run.discard(KEPT)
+    if is_new or not run.file("report.json").exists():  # a kill may come between them
+        run.write_json("report.json", summary(source, options, run, calibrated.get(), mesh.get(), fields.get()))
 
 
 def _plan_time(source: Source, options: RunOptions, run: RunFolder, stages: str) -> None:
@@ -108,60 +132,51 @@ def _plan_time(source: Source, options: RunOptions, run: RunFolder, stages: str)
     run.progress("capture", message=message, numbers=plan_numbers(plan))
 
 
-def _reconstruct(
-    source: Source, options: RunOptions, run: RunFolder, photos: Lazy[AllPhotos], calibration: Lazy[CalibratedViews]
-) -> None:
-    """Do the stages after the calibration: check, solve, mesh, detail, report.json."""
-    if source.session is not None and source.ground_is_known(options) and not run.is_finished("solve"):
-        done_once(run, "check", "judging the photos", lambda: _check(source, run, photos, calibration), needs=photos)
-    solved = once(
-        run,
-        "solve",
-        _fitting(options),
-        lambda: _solved(source, options, run, photos, _within_memory(source, options, run, calibration.get())),
-        FIELDS,
-        needs=photos,
-    )
-    if source.scale(options) is not None and run.is_finished("solve"):
-        _keep_scale(source, options, run, calibration.get(), solved.get())
-    calibration.forget()  # the memory plan may have left out photos
-    mesh = Lazy(lambda: extract_mesh(solved.get()))
-    is_new = done_once(
-        run,
-        "mesh",
-        "making the mesh",
-        lambda: _save(mesh.get(), solved.get(), calibration.get(), run),
-    )
-    if detail_is_asked(source, options):
-        is_new |= done_once(
-            run,
-            "detail",
-            "reading relief and colours from the whole photos",
-            lambda: write_detail(source, options, run, photos.get(), calibration.get(), solved.get()),
-            needs=photos,
-        )
-    if run.is_finished("solve"):  # a visitor of the page may have stopped it: then the same command goes on
-        run.discard(KEPT)
-    if is_new or not run.file("report.json").exists():  # a kill may come between them
-        run.write_json("report.json", summary(source, options, run, calibration.get(), mesh.get(), solved.get()))
+def _read(source: Source, options: RunOptions, run: RunFolder) -> tuple[Photos, ...]:
+    """Stage "capture": done by every invocation that needs photos; they stay in the run folder in the meantime."""
+    with run.stage("capture", f"reading {len(source.photos())} photos", leaves_files=False):
+        for one in source.left_out():
+            run.progress(message=f"{one.called} is left out: {one.kind}, {one.text}")
+        plan = _plan(source, options, run)
+        if plan is not None:
+            run.progress(message=plan.sentence)
+            run.activity(f"reading {len(source.photos())} photos")
+        longest = 2 * options.long_side() ** 2
+        has_room = shutil.disk_usage(run.path).free > KEPT_PER_PIXEL * longest * len(source.photos())
+        photos = read_photos(source, options, run.file(KEPT) if has_room else None, plan)
+        if not run.is_finished("calibrate"):
+            write_thumbnails(source, run)
+    return photos
+
+
+def _calibrated(source: Source, photos: Sequence[Photos], options: RunOptions, run: RunFolder) -> CalibratedViews:
+    """Stage "calibrate"; small photos are named anew if the first view is left out."""
+    with told("calibration", run.activity):
+        calibrated = calibrate_source(source, photos, options)
+    if len(photos) > 1 and photos[0].view != calibrated.views[0].name:
+        write_thumbnails(source, run, calibrated.views[0].name)
+    return calibrated
+
+
+def _check(source: Source, photos: Sequence[Photos], calibrated: CalibratedViews, run: RunFolder) -> None:
+    """Write check.json, as `shadowgraph check`; a hopeless capture ends the run, other reasons become warnings."""
+    checked = check_capture(source, photos, calibrated)
+    run.write_json("check.json", checked.document())
+    run.progress(message=checked.readiness.sentence())
+    refuse_hopeless(checked.readiness)
 
 
 def _solved(
-    source: Source, options: RunOptions, run: RunFolder, photos: Lazy[AllPhotos], calibrated: CalibratedViews
+    source: Source, photos: Lazy[tuple[Photos, ...]], calibrated: CalibratedViews, options: RunOptions, run: RunFolder
 ) -> Fields:
-    """Stage "solve"; a surface that no visitor stopped gets the given scale."""
-    found, length = solve(source, options, run, photos, calibrated), source.scale(options)
+    """Stage "solve", see solve_stage; a surface that no visitor stopped gets the given scale."""
+    calibrated = _within_memory(source, options, run, calibrated)
+    fields, length = solve(source, options, run, photos, calibrated), source.scale(options)
     if source.known is not None and source.known.left_out is not None and source.ground_is_known(options):
-        found = without_ball(found, source.known.left_out, calibrated.first.posed_camera)
+        fields = without_ball(fields, source.known.left_out, calibrated.first.posed_camera)
     if length is None or run.is_left_open:
-        return found
-    return in_millimetres(found, length, source.ground_is_known(options))
-
-
-def _save(mesh: trimesh.Trimesh, fields: Fields, calibrated: CalibratedViews, run: RunFolder) -> None:
-    """Write the results, see CONVENTIONS.md."""
-    save_results(mesh, fields, calibrated.first, run.path)
-    save_views_maps(fields, calibrated, run.path)
+        return fields
+    return in_millimetres(fields, length, source.ground_is_known(options))
 
 
 def _keep_scale(
@@ -173,32 +188,6 @@ def _keep_scale(
         known = source.ground_is_known(options)
         scaled = [with_scale_of(view.calibration, fields, length, known) for view in calibrated.views]
         save_views(calibrated.with_calibrations(scaled), run.file("calibration.json"))
-
-
-def _read(source: Source, options: RunOptions, run: RunFolder) -> AllPhotos:
-    """Stage "capture": done by every invocation that needs photos; they stay in the run folder in the meantime."""
-    with run.stage("capture", f"reading {len(source.photos())} photos", leaves_files=False):
-        for one in source.left_out():
-            run.progress(message=f"{one.called} is left out: {one.kind}, {one.text}")
-        plan = _plan(source, options, run)
-        if plan is not None:
-            run.progress(message=plan.sentence)
-            run.activity(f"reading {len(source.photos())} photos")
-        longest = 2 * options.long_side() ** 2
-        has_room = shutil.disk_usage(run.path).free > KEPT_PER_PIXEL * longest * len(source.photos())
-        photos = read_views(source, options, run.file(KEPT) if has_room else None, plan)
-        if not run.is_finished("calibrate"):
-            write_thumbnails(source, run)
-    return photos
-
-
-def _check(source: Source, run: RunFolder, photos: Lazy[AllPhotos], calibration: Lazy[CalibratedViews]) -> None:
-    """Write check.json, as `shadowgraph check`; a hopeless capture ends the run, other reasons become warnings."""
-    checked = check_capture(source, photos.get(), calibration.get())
-    readiness = checked.readiness
-    run.write_json("check.json", checked.document())
-    run.progress(message=readiness.sentence())
-    refuse_hopeless(readiness)
 
 
 def _fitting(options: RunOptions) -> str:
@@ -263,15 +252,6 @@ def refuse_device(options: RunOptions) -> None:
     solver_device(options.device)
 
 
-def _calibrated(source: Source, photos: AllPhotos, options: RunOptions, run: RunFolder) -> CalibratedViews:
-    """Stage "calibrate"; small photos are named anew if the first view is left out."""
-    with told("calibration", run.activity):
-        found, views = calibrate_source_views(source, photos, options), source.views()
-    if len(views) > 1 and views[0].capture is not None and views[0].capture.name != found.views[0].name:
-        write_thumbnails(source, run, found.views[0].name)
-    return found
-
-
 def write_thumbnails(source: Source, run: RunFolder, first: str | None = None) -> None:
     """Write thumbs/*.jpg: small sRGB copies for page and report, see thumbnail_name.
 
@@ -281,9 +261,9 @@ def write_thumbnails(source: Source, run: RunFolder, first: str | None = None) -
     Raises:
         CaptureError: a photo cannot be read.
     """
-    names = ["" if view.capture is None else view.capture.name for view in source.views()]
-    for name, view in zip(names, source.views(), strict=True):
-        before = "" if name == (names[0] if first is None else first) else f"{name}/"
+    first = source.views()[0].name if first is None else first
+    for view in source.views():
+        before = "" if view.name == first else f"{view.name}/"
         for photo in view.photos():
             with run.writing(f"{THUMBS}/{thumbnail_name(before + photo.name)}") as path:
                 Image.fromarray(read_thumbnail(photo, THUMBNAIL_LONG_SIDE)).save(path, quality=THUMBNAIL_QUALITY)

@@ -57,7 +57,7 @@ class RequestSteering:
             return True
         return self.is_stopped()
 
-    def ends_solve(self, state: SolveState, config: FitConfig) -> bool:
+    def ends_solve(self, state: SolveState, config: FitConfig) -> bool | Rescheduled:
         """After a level, follow the requested resolution: continue with its finer levels, or stop if it adds none.
 
         Args:
@@ -73,7 +73,7 @@ class RequestSteering:
         new = self._continued(config, state.level, asked[-1])
         if new is not None and new != config:
             self._run.remark(f"{ON_REQUEST}going on as {asked[-1]} after round {state.level}")
-            raise Rescheduled(state, new, asked[-1])
+            return Rescheduled(state, new, asked[-1])
         if new is None and state.level < len(config.levels):
             self._stop(f"ended after round {state.level}, as fine as {asked[-1]}")
         return self.was_stopped

@@ -15,12 +15,15 @@ from reconstruct.mesh.mesh import mesh_material, save_mesh
 from reconstruct.render.g_buffer import surface_maps
 
 
-def save_results(mesh: trimesh.Trimesh, fields: Fields, calibration: Calibration, folder: Path) -> None:
+def save_results(mesh: trimesh.Trimesh, fields: Fields, calibrated: CalibratedViews, folder: Path) -> None:
     """Write mesh.ply, mesh.glb, depth.npy, normal.npy and mask.png, each whole or absent; see CONVENTIONS.md.
+
+    The maps are those of the first view's camera: depth along its z axis, normals in the world frame. Where there are
+    several views, the maps of each follow in a folder of its name. Those of another lie belong to that lie's
+    calibration: normals in its world, the maps cut at its ground.
 
     Args:
         mesh: of extract_mesh(fields).
-        calibration: whose camera the maps belong to: depth along its z axis, normals in the world frame.
 
     Raises:
         ReconstructionError: the mesh is empty, or a file does not read back.
@@ -28,17 +31,7 @@ def save_results(mesh: trimesh.Trimesh, fields: Fields, calibration: Calibration
     """
     folder.mkdir(parents=True, exist_ok=True)
     save_mesh(mesh, folder / "mesh.ply", folder / "mesh.glb", fields.unit, mesh_material(fields, mesh))
-    save_maps(fields, calibration, folder)
-
-
-def save_views_maps(fields: Fields, calibrated: CalibratedViews, folder: Path) -> None:
-    """Write the maps of every view into a folder of its name, where there are several.
-
-    Those of another lie belong to that lie's calibration: normals in its world, the maps cut at its ground.
-
-    Raises:
-        OSError: no room, or no right to write there.
-    """
+    save_maps(fields, calibrated.first, folder)
     calibrations = {view.name: view.calibration for view in calibrated.every()}
     for view in fields.views():
         if view.view in calibrations and view.view:

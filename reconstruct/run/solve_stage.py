@@ -6,14 +6,14 @@ from dataclasses import asdict, replace
 
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
-from capture.errors import CaptureError, ReconstructionError
+from capture.errors import ReconstructionError
 from capture.files.atomic import read_json
 from capture.files.regular import why
 from reconstruct.config import FitConfig
 from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import preview_mesh
 from reconstruct.mesh.photo_colours import PhotoColours
-from reconstruct.run.lies_stage import Lies, forget_lies, joined_scenes, lay_lies_together
+from reconstruct.run.lies_stage import forget_lies, joined_lies
 from reconstruct.run.machine import within_budget, work_of
 from reconstruct.run.presets import config_from_json, continued, solver_config, training
 from reconstruct.run.request_steering import RequestSteering
@@ -25,75 +25,43 @@ from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.trainer import train
 from reconstruct.solve.backend import solver_device, training_device
 from reconstruct.solve.checkpoint import load_state, save_state
-from reconstruct.solve.solver import SolveReporter, begun, fit
+from reconstruct.solve.solver import SolveReporter, fit_steered
 from reconstruct.solve.steering import Rescheduled
 from reconstruct.source.options import LONG_SIDES, RunOptions
-from reconstruct.source.photos import Photos, read_views
+from reconstruct.source.photos import Photos, read_photos
 from reconstruct.source.source import Source
 from reconstruct.views import Scenes
 
 EARLIER = "checkpoint_earlier.safetensors"  # state of a solve when a visitor of the page chose another resolution
-AllPhotos = tuple[Photos | CaptureError, ...]  # of all views, see read_views
 RESOLUTION = "resolution"  # key of config.json: the preset that was chosen then
 
 
-SeenView = tuple[str, Photos, Calibration]  # of one camera: its view's name, "" where there is one
+def seen_views(photos: Sequence[Photos], calibrated: CalibratedViews) -> tuple[tuple[Photos, Calibration], ...]:
+    """Return photos and calibration of each calibrated view; photos as read_photos reads them."""
+    by_name = {one.view: one for one in photos}
+    return tuple((by_name[view.name], view.calibration) for view in calibrated.views)
 
 
-def seen_views(
-    source: Source, photos: Sequence[Photos | CaptureError], calibrated: CalibratedViews
-) -> tuple[SeenView, ...]:
-    """Return what is known of each calibrated view of a source.
+def prepare_scene(source: Source, photos: Sequence[Photos], calibrated: CalibratedViews, options: RunOptions) -> Scenes:
+    """Return the photos and calibration of each calibrated view as torch tensors.
 
-    Args:
-        photos: as read_views reads them, in the order of source.views().
-    """
-    names = ["" if view.capture is None else view.capture.name for view in source.views()]
-    if len(names) == 1:
-        names = [calibrated.views[0].name]
-    found = dict(zip(names, photos, strict=True))
-    views = [(view.name, found[view.name], view.calibration) for view in calibrated.views]
-    return tuple((name, own, calibration) for name, own, calibration in views if isinstance(own, Photos))
-
-
-def prepare_views(source: Source, views: Sequence[SeenView], options: RunOptions) -> Scenes:
-    """Return the scene of each view, see prepare_scene.
-
-    Raises:
-        ReconstructionError: as of prepare_scene.
-    """
-    names = [name if len(views) > 1 else "" for name, _, _ in views]
-    scenes = [prepare_scene(source, photos, calibration, options) for _, photos, calibration in views]
-    return tuple(replace(scene, view=name) for name, scene in zip(names, scenes, strict=True))
-
-
-def _lies(source: Source, photos: AllPhotos, calibrated: CalibratedViews, options: RunOptions) -> Lies:
-    """Return the scenes of each further lie, in its own world."""
-    found = []
-    for lie in calibrated.lies:
-        views = seen_views(source, photos, lie)
-        if views:
-            scenes = zip(prepare_views(source, views, options), views, strict=True)
-            found.append((lie.name, tuple(replace(scene, view=view[0]) for scene, view in scenes)))
-    return tuple(found)
-
-
-def prepare_scene(source: Source, photos: Photos, calibration: Calibration, options: RunOptions) -> Scene:
-    """Return photos and calibration as torch tensors, at the preset's size or the largest that fits into memory.
+    They have the preset's size, or the largest that fits into memory.
 
     Raises:
         ReconstructionError: no photo has a usable light, the photos differ in size from the calibrated camera's, or the
             uneven ground is above the camera.
     """
-    long_side = LONG_SIDES[options.preset]
-    if photos.plan is not None:
-        long_side = min(long_side, photos.plan.long_side)
-    scene = build_scene(photos.stack, calibration, long_side, photos.shadow, photos.mask, photos.ground_depth)
-    return replace(scene, ground_known=source.ground_is_known(options))
+    scenes, long_side = [], LONG_SIDES[options.preset]
+    for own, calibration in seen_views(photos, calibrated):
+        side = long_side if own.plan is None else min(long_side, own.plan.long_side)
+        scene = build_scene(own.stack, calibration, side, own.shadow, own.mask, own.ground_depth)
+        name = own.view if len(calibrated.views) > 1 or calibrated.name else ""
+        scenes.append(replace(scene, ground_known=source.ground_is_known(options), view=name))
+    return tuple(scenes)
 
 
 def solve(
-    source: Source, options: RunOptions, run: RunFolder, photos: Lazy[AllPhotos], calibrated: CalibratedViews
+    source: Source, options: RunOptions, run: RunFolder, photos: Lazy[tuple[Photos, ...]], calibrated: CalibratedViews
 ) -> Fields:
     """Build the scenes of all views and fit the surface, or train a field; repeat for another chosen resolution.
 
@@ -103,52 +71,44 @@ def solve(
         UserError: as `fit` and `train`, or a photo cannot be read.
     """
     device = (training_device if options.is_trained() else solver_device)(options.device)
-    checkpoint = run.file("checkpoint.safetensors")
+    checkpoint, doubts = run.file("checkpoint.safetensors"), ()
     while True:
         resolution, config = schedule(options, run, source)
         chosen = replace(options, preset=resolution)
-        found = _photos_for(chosen, source, options, run, photos)
-        scenes = prepare_views(source, seen_views(source, found, calibrated), chosen)
+        read = _photos_for(chosen, source, options, run, photos)
+        scenes = prepare_scene(source, read, calibrated, chosen)
         report = _reporter(run, scenes[0])
         if isinstance(config, TrainConfig):
             steering = RequestSteering(run)
-            fields = train(scenes[0], config, report, checkpoint, device, steering)
-            break
-        lies = _lies(source, found, calibrated, chosen) if source.ground_is_known(options) else ()
-        start, doubts = None, ()
-        if lies:
-            together = lay_lies_together(scenes, lies, config.seed, run, report, device)
-            scenes = joined_scenes(scenes, lies, together.placed)
-            doubts = tuple(text for _, text in together.refused)
-            if together.placed:
-                start = begun(together.start, min(1, len(config.levels) - 1), scenes)
-        steering = RequestSteering(run, config, continued)
-        try:
+            solved = train(scenes[0], config, report, checkpoint, device, steering)
+        else:
+            lies = [(lie.name, prepare_scene(source, read, lie, chosen)) for lie in calibrated.lies]
+            scenes, start, doubts = joined_lies(scenes, tuple(lies), config, run, report, device)
+            steering = RequestSteering(run, config, continued)
             earlier = load_state(run.file(EARLIER), json.dumps(asdict(config))) or start
-            fields = fit(scenes, config, report, checkpoint, device, steering, earlier, run.activity)
-            fields = replace(fields, doubts=(*fields.doubts, *doubts))
+            solved = fit_steered(scenes, config, report, checkpoint, device, steering, earlier, run.activity)
+        if not isinstance(solved, Rescheduled):
             break
-        except Rescheduled as change:
-            _reschedule(change, run)
+        _keep_schedule(solved, run)
     if steering.was_stopped:
         run.leave_open()
     else:
         forget_lies(run)
     run.reopen("mesh", "detail")  # of a surface that was stopped earlier
-    return fields
+    return replace(solved, doubts=(*solved.doubts, *doubts))
 
 
 def _photos_for(
-    chosen: RunOptions, source: Source, options: RunOptions, run: RunFolder, photos: Lazy[AllPhotos]
-) -> AllPhotos:
+    chosen: RunOptions, source: Source, options: RunOptions, run: RunFolder, photos: Lazy[tuple[Photos, ...]]
+) -> tuple[Photos, ...]:
     """Return the photos at the chosen resolution's size; only those stored in the run folder stay in memory."""
-    kept, pictures = run.file(KEPT), photos.get()
+    kept, read = run.file(KEPT), photos.get()
     if chosen.long_side() != options.long_side():
-        plan = next((one.plan for one in pictures if isinstance(one, Photos)), None)
-        return read_views(source, chosen, kept if kept.is_dir() else None, plan)
+        plan = next((one.plan for one in read if one.error is None), None)
+        return read_photos(source, chosen, kept if kept.is_dir() else None, plan)
     if not kept.is_dir():
         photos.forget()
-    return pictures
+    return read
 
 
 def schedule(options: RunOptions, run: RunFolder, source: Source) -> tuple[str, FitConfig | TrainConfig]:
@@ -179,7 +139,7 @@ def schedule(options: RunOptions, run: RunFolder, source: Source) -> tuple[str, 
     return options.preset, config
 
 
-def _reschedule(change: Rescheduled, run: RunFolder) -> None:
+def _keep_schedule(change: Rescheduled, run: RunFolder) -> None:
     """Store the current state and the new schedule; the change takes effect with the second file, config.json."""
     save_state(change.state, json.dumps(asdict(change.config)), run.file(EARLIER))
     run.write_json("config.json", asdict(change.config) | {RESOLUTION: change.resolution})

@@ -54,11 +54,9 @@ def once(
         needs: a value that is made in its own stage, before this stage begins.
     """
     path = run.file(result.file)
-    if not (run.is_finished(stage) and path.exists()):  # a result that somebody removed is made again
-        if needs is not None:
-            needs.get()
-        with run.stage(stage, message):
-            result.save(make(), path)
+    if not path.exists():
+        run.reopen(stage)  # a result that somebody removed is made again
+    done_once(run, stage, message, lambda: result.save(make(), path), needs)
     return Lazy(lambda: result.load(path))
 
 

@@ -22,7 +22,8 @@ from reconstruct.shadowneus.model import Model
 from reconstruct.shadowneus.train_pixels import TrainPixels, make_train_pixels
 from reconstruct.shadowneus.train_step import losses
 from reconstruct.shadowneus.unit_frame import UnitFrame, object_frame, read_onto_grid, unit_height
-from reconstruct.solve.solver import NO_STEERING, SolveReporter, fingerprint
+from reconstruct.solve.checkpoint import fingerprint
+from reconstruct.solve.solver import NO_STEERING, SolveReporter
 from reconstruct.solve.steering import Steering
 
 REPORT_EVERY = 10  # iterations

@@ -3,9 +3,11 @@
 Both backends use the same state: either can resume a checkpoint of the other.
 """
 
+import hashlib
 import json
 import time
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +18,32 @@ from capture.errors import UserError
 from capture.files.json_field import JsonField
 from capture.files.regular import why
 from reconstruct.fields import Verdict, checked_grid
+from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import thread_count
 from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, Log, read_checkpoint, write_checkpoint
 from reconstruct.solve.early_stopping import EarlyStopping
 from reconstruct.solve.light_refine import LightShift
 from reconstruct.tensor_file import parsed, read_tensors
+from reconstruct.views import Scenes, each
 
 VERSION = "9"
+FINGERPRINTED = (
+    "rgb",
+    "shadow",
+    "mask",
+    "usable",
+    "directions",
+    "eye",
+    "lights",
+    "power",
+    "axis",
+    "beam",
+    "ambient",
+    "light_sigma",
+    "photo_of_light",
+    "ground_depth",
+)
 
 
 @dataclass(frozen=True)
@@ -42,6 +63,20 @@ class SolveState:
     began_with: str  # name of the Start that made the first surface: a resumed solve tries no other
     verdict: Verdict | None = None  # on the lights, at the end of an earlier level
     left_out: tuple[int, ...] = ()  # photos whose rays gave non-finite numbers
+
+
+def fingerprint(scenes: Scene | Scenes, config: Any) -> str:
+    """Return a hash of everything a surface depends on: settings (a dataclass), pictures, lights, camera."""
+    digest = hashlib.sha256(json.dumps(asdict(config), sort_keys=True).encode())
+    for scene, name in product(each(scenes), FINGERPRINTED):
+        value = getattr(scene, name)
+        if value is not None:
+            digest.update(np.ascontiguousarray(value.numpy()).data)
+    for scene in each(scenes):
+        digest.update(f"{scene.ground_height} {scene.ground_known} {thread_count()}".encode())
+        if scene.object_from_world is not None:
+            digest.update(scene.object_from_world.matrix().tobytes())
+    return digest.hexdigest()
 
 
 def save_state(state: SolveState, fingerprint: str, path: Path) -> None:

@@ -1,13 +1,10 @@
 """From labels to a surface: move an SDF grid until every shadow ray agrees with its pixel's label."""
 
-import hashlib
-import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from itertools import product
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -26,14 +23,13 @@ from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet, resampled
 from reconstruct.sdf.normal_fusion import combine_with_normals
-from reconstruct.sdf.rays import thread_count
 from reconstruct.solve.backend import surface_on
-from reconstruct.solve.checkpoint import CheckpointWriter, SolveState, load_state, save_state
+from reconstruct.solve.checkpoint import CheckpointWriter, SolveState, fingerprint, load_state, save_state
 from reconstruct.solve.early_stopping import EarlyStopping
 from reconstruct.solve.level import LevelFit, is_rest
 from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift
 from reconstruct.solve.ray_counts import ray_counts
-from reconstruct.solve.steering import NoSteering, Steering
+from reconstruct.solve.steering import NoSteering, Rescheduled, Steering
 from reconstruct.solve.step_guard import NotFiniteError
 from reconstruct.solve.trials import before_trial, hull_is_better, shadow_doubts, try_lights
 from reconstruct.solve.unseen import without_unsupported_matter
@@ -47,22 +43,6 @@ NO_STEERING = NoSteering()
 TRIALS = 2  # of moved lights: later levels start near the truth, and a rejected light's traces would outlast them
 FEWEST_PHOTOS = 4  # below, shadows leave most of the shape open
 SEED_OF_VIEWS = 1000  # of the rays held out from further views, beside the seed
-FINGERPRINTED = (
-    "rgb",
-    "shadow",
-    "mask",
-    "usable",
-    "directions",
-    "eye",
-    "lights",
-    "power",
-    "axis",
-    "beam",
-    "ambient",
-    "light_sigma",
-    "photo_of_light",
-    "ground_depth",
-)
 
 
 @runtime_checkable
@@ -80,7 +60,6 @@ def fit(
     report: SolveReporter,
     checkpoint: Path | None = None,
     device: torch.device | None = None,
-    steering: Steering = NO_STEERING,
     earlier: SolveState | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> Fields:
@@ -96,16 +75,36 @@ def fit(
         scene: what one camera sees, or what each of several does: one surface is solved from all.
         checkpoint: a file that is written every few seconds and resumed from.
         device: the torch device of the surface; None for the CPU kernels, see reconstruct.solve.backend.
-        steering: may pause the solve, end a level or all of it.
         earlier: the state reached with another schedule, at the beginning of a level of this one.
         say: is told what is done between two reports.
 
     Raises:
         ReconstructionError: no object, no shadow, light positions that contradict each other, views without a common
             ground, or no memory on the device.
-        Rescheduled: by `steering`.
+    """
+    solved = fit_steered(scene, config, report, checkpoint, device, NO_STEERING, earlier, say)
+    assert isinstance(solved, Fields)  # nobody asks for another schedule
+    return solved
+
+
+def fit_steered(
+    scene: Scene | Scenes,
+    config: FitConfig,
+    report: SolveReporter,
+    checkpoint: Path | None,
+    device: torch.device | None,
+    steering: Steering,
+    earlier: SolveState | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> Fields | Rescheduled:
+    """Fit as `fit` does, while `steering` may pause the solve, end a level or all of it, or change the schedule.
+
+    Raises:
+        ReconstructionError: as of `fit`.
     """
     solved = _solved(each(scene), config, report, checkpoint, device, steering, earlier, say)
+    if isinstance(solved, Rescheduled):
+        return solved
     say("reading albedo and gloss from the photos, and comparing each light with the shadows under the others")
     found = _fields(solved.observers, solved.lit, solved.rays, solved.begin, solved.surface)
     return as_stored(replace(found, light_trial=solved.state.verdict))
@@ -125,7 +124,9 @@ def fit_surface(
     Raises:
         ReconstructionError: as of `fit`.
     """
-    return _solved(each(scene), config, report, checkpoint, device, NO_STEERING, earlier, say).surface
+    solved = _solved(each(scene), config, report, checkpoint, device, NO_STEERING, earlier, say)
+    assert isinstance(solved, _Solved)  # nobody asks for another schedule
+    return solved.surface
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ def _solved(
     steering: Steering,
     earlier: SolveState | None,
     say: Callable[[str], None],
-) -> _Solved:
+) -> _Solved | Rescheduled:
     """Run all levels of a solve, see `fit`."""
     scenes = tuple(with_object_mask(one) for one in scenes)
     check_common(scenes)
@@ -168,7 +169,11 @@ def _solved(
             except (NotFiniteError, torch.OutOfMemoryError) as fault:
                 writer.state = _last_good_state(writer.state, fault, task)
                 continue
-            if steering.ends_solve(state, begin.config):
+            end = steering.ends_solve(state, begin.config)
+            if isinstance(end, Rescheduled):
+                writer.write()
+                return end
+            if end:
                 writer.write()
                 break
             if state.level == len(begin.config.levels):
@@ -383,17 +388,3 @@ class _Timer:
     def shown(self, cost: float) -> None:
         """Set the next time after a surface was shown, which took `cost` seconds of CPU time."""
         self._next = time.monotonic() + max(self._seconds, cost / SHARE_OF_SHOWING)
-
-
-def fingerprint(scenes: Scene | Scenes, config: Any) -> str:
-    """Return a hash of everything a surface depends on: settings (a dataclass), pictures, lights, camera."""
-    digest = hashlib.sha256(json.dumps(asdict(config), sort_keys=True).encode())
-    for scene, name in product(each(scenes), FINGERPRINTED):
-        value = getattr(scene, name)
-        if value is not None:
-            digest.update(np.ascontiguousarray(value.numpy()).data)
-    for scene in each(scenes):
-        digest.update(f"{scene.ground_height} {scene.ground_known} {thread_count()}".encode())
-        if scene.object_from_world is not None:
-            digest.update(scene.object_from_world.matrix().tobytes())
-    return digest.hexdigest()

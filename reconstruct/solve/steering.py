@@ -4,19 +4,20 @@ A solve without requests is not affected. A stopped solve is resumed bit for bit
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from reconstruct.config import FitConfig
 from reconstruct.solve.checkpoint import SolveState
 
 
-class Rescheduled(Exception):
-    """Signals that the solve must continue with another schedule."""
+@dataclass(frozen=True)
+class Rescheduled:
+    """The end of a solve that has to continue with another schedule."""
 
-    def __init__(self, state: SolveState, config: FitConfig, resolution: str):
-        """Continue from `state`, at the beginning of a level of `config`; `resolution` is the name of its preset."""
-        super().__init__(resolution)
-        self.state, self.config, self.resolution = state, config, resolution
+    state: SolveState  # at the beginning of a level of `config`
+    config: FitConfig
+    resolution: str  # the name of its preset
 
 
 @runtime_checkable
@@ -35,12 +36,8 @@ class Steering(Protocol):
         """Return whether to end this level, and continue with the next one if any."""
         ...
 
-    def ends_solve(self, state: SolveState, config: FitConfig) -> bool:
-        """Return whether to end the solve after a level.
-
-        Raises:
-            Rescheduled: continue with another schedule.
-        """
+    def ends_solve(self, state: SolveState, config: FitConfig) -> bool | Rescheduled:
+        """Return whether to end the solve after a level, and with what other schedule to continue if any."""
         ...
 
 

@@ -19,31 +19,23 @@ from reconstruct.source.photos import Photos
 from reconstruct.source.source import Source
 
 
-def calibrate_source(source: Source, photos: Photos, options: RunOptions) -> Calibration:
+def calibrate_source(source: Source, photos: Sequence[Photos], options: RunOptions) -> CalibratedViews:
     """Return a scene's given calibration, or calibrate the photos, with the lights from a file if --lights names one.
 
-    Of a source of one view; calibrate_source_views calibrates several. Photos beyond what fits into memory
-    (`photos.plan`) are marked as not used.
-
-    Raises:
-        CalibrationError, CaptureError: the board, the ground or the lights cannot be found, or the file lacks a light.
-    """
-    return calibrate_source_views(source, (photos,), options).first
-
-
-def calibrate_source_views(
-    source: Source, photos: Sequence[Photos | CaptureError], options: RunOptions
-) -> CalibratedViews:
-    """Return the calibrations of every view of a source, in one frame.
+    Photos beyond what fits into memory (`photos.plan`) are marked as not used.
 
     Args:
-        photos: as read_views reads them.
+        photos: of every view, as read_photos reads them.
+
+    Returns:
+        The calibrations of every view that has one, in one frame.
 
     Raises:
-        CalibrationError, CaptureError: as calibrate_source, if no view can be calibrated.
+        CalibrationError, CaptureError: the board, the ground or the lights of no view can be found, or the file lacks
+            a light.
     """
     views = _calibrated(source, photos, options)
-    plan = next((one.plan for one in photos if isinstance(one, Photos)), None)
+    plan = next((one.plan for one in photos if one.error is None), None)
     has_scale, is_known = source.scale(options) is not None, source.ground_is_known(options)
     is_one, every = len(source.views()) == 1, len(source.photos())
 
@@ -76,23 +68,23 @@ def with_light_error(calibration: Calibration, relative: float) -> Calibration:
     return replace(calibration, lights=tuple(lights))
 
 
-def _calibrated(source: Source, photos: Sequence[Photos | CaptureError], options: RunOptions) -> CalibratedViews:
-    first = photos[0]
+def _calibrated(source: Source, photos: Sequence[Photos], options: RunOptions) -> CalibratedViews:
+    stack = photos[0].stack
     if source.known is not None:
-        assert isinstance(first, Photos)
         if options.lights in WAYS or source.known.lights_from == Path(options.lights):
             return CalibratedViews.of(source.known.with_notes())
-        return CalibratedViews.of(scene_with_file(source.known, first.stack, Path(options.lights)))
+        return CalibratedViews.of(scene_with_file(source.known, stack, Path(options.lights)))
     assert source.capture is not None and source.session is not None
     if options.lights in WAYS:
-        found = [one if isinstance(one, CaptureError) else _of_view(one) for one in photos]
-        return calibrate_views(source.capture, found, options.board, options.lights)
-    assert isinstance(first, Photos) and first.stack is not None
+        return calibrate_views(source.capture, [_of_view(one) for one in photos], options.board, options.lights)
+    assert stack is not None
     named = (Path(options.lights), options.board)
-    return CalibratedViews.of(calibrate_with_file(source.session, first.stack, *named, first.findings))
+    return CalibratedViews.of(calibrate_with_file(source.session, stack, *named, photos[0].findings), photos[0].view)
 
 
-def _of_view(photos: Photos) -> ViewPhotos:
+def _of_view(photos: Photos) -> ViewPhotos | CaptureError:
+    if photos.error is not None:
+        return photos.error
     assert photos.stack is not None
     return ViewPhotos(photos.stack, photos.findings)
 

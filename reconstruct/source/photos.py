@@ -28,66 +28,53 @@ SAME_SHAPE = 0.02  # of the ratio of the sides: sizes are rounded to pixels
 
 @dataclass(frozen=True)
 class Photos:
-    """The pictures of one source, on the photos' pixel grid."""
+    """The pictures of one view, on the photos' pixel grid."""
 
-    stack: PhotoStack | None  # None: shadow pictures alone are used
+    stack: PhotoStack | None  # None: shadow pictures alone are used, or `error` says why there are no pictures
     findings: tuple[Finding, ...] = ()
     shadow: Float[np.ndarray, "photos height width"] | None = None  # 1 = lit
     mask: Float[np.ndarray, "mask_height mask_width"] | None = None  # 1 = object
     ground_depth: Float[np.ndarray, "full_height full_width"] | None = None
     plan: Plan | None = None  # the part of them that fits into memory; None: all
+    view: str = ""  # its name, where there are several
+    error: CaptureError | None = None  # why one of several views cannot be read
 
 
-def read_photos(source: Source, options: RunOptions, kept: Path | None = None, plan: Plan | None = None) -> Photos:
-    """Read and check the photos, the given shadow pictures (if asked for or if there are no photos), or both.
-
-    Of a source of one view; read_views reads several.
+def read_photos(
+    source: Source, options: RunOptions, kept: Path | None = None, plan: Plan | None = None
+) -> tuple[Photos, ...]:
+    """Read and check the photos of each view, the given shadow pictures (if asked for or there are no photos), or both.
 
     Args:
         kept: a folder for intermediate results; results that it already holds are reused, see read_stack.
         plan: the photos and pixels that fit into memory, from an earlier invocation; made now unless given.
 
-    Raises:
-        CaptureError: a photo cannot be read, the photos differ in size, or a mask fits none of them.
-    """
-    if len(source.views()) > 1:
-        raise ValueError(f"{source.folder} has {len(source.views())} views: read_views reads them")
-    kept = None if kept is None else kept / str(options.long_side())
-    if plan is None:
-        plan = memory_plan(source, options)
-    if source.session is not None:
-        return _photos_of_session(source.session, options, kept, plan)
-    assert source.known is not None
-    photos = _photos_of_scene(source.known, options, kept, plan)
-    return photos if source.ground_is_known(options) else _without_left_out(photos, source.known)
-
-
-def read_views(
-    source: Source, options: RunOptions, kept: Path | None = None, plan: Plan | None = None
-) -> tuple[Photos | CaptureError, ...]:
-    """Read and check the photos of each view, in the order of source.views(); an error for a view of several.
-
-    Args:
-        kept, plan: as read_photos takes them, for all views.
+    Returns:
+        One for each of source.views(), in their order; where some of several cannot be read, with the `error`.
 
     Raises:
-        CaptureError: as read_photos, of a source of one view, or if no view can be read.
+        CaptureError: no view can be read: a photo cannot, the photos differ in size, or a mask fits none of them.
     """
-    views = source.views()
-    if len(views) == 1:
-        return (read_photos(source, options, kept, plan),)
     plan = memory_plan(source, options) if plan is None else plan
-    found: list[Photos | CaptureError] = []
-    for view in views:
-        name = "" if view.capture is None else view.capture.name
+    found = []
+    for view in source.views():
         try:
-            found.append(read_photos(view, options, kept and kept.joinpath(*name.split("/")), plan))
+            found.append(_photos_of_view(view, options, kept and kept.joinpath(*view.name.split("/")), plan))
         except CaptureError as error:
-            found.append(error)
-    errors = [one for one in found if isinstance(one, CaptureError)]
+            found.append(Photos(None, view=view.name, error=error))
+    errors = [one.error for one in found if one.error is not None]
     if len(errors) == len(found):
         raise errors[0]
     return tuple(found)
+
+
+def _photos_of_view(source: Source, options: RunOptions, kept: Path | None, plan: Plan | None) -> Photos:
+    kept = None if kept is None else kept / str(options.long_side())
+    if source.session is not None:
+        return replace(_photos_of_session(source.session, options, kept, plan), view=source.name)
+    assert source.known is not None
+    photos = _photos_of_scene(source.known, options, kept, plan)
+    return photos if source.ground_is_known(options) else _without_left_out(photos, source.known)
 
 
 def memory_plan(source: Source, options: RunOptions) -> Plan | None:

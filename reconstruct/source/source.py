@@ -56,6 +56,11 @@ class Source:
         """The session of a capture's first view; the only one of most captures."""
         return None if self.capture is None else self.capture.views[0]
 
+    @property
+    def name(self) -> str:
+        """The name of the view that this source is; "" where there is one."""
+        return "" if self.capture is None else self.capture.name
+
     def views(self) -> tuple["Source", ...]:
         """Return a source for each session of a capture, those of its lies last; a scene is one view."""
         if self.capture is None:
@@ -124,7 +129,7 @@ class Source:
 
 
 def open_source(folder: Path, options: RunOptions) -> Source:
-    """Find out what a folder holds: reads names, and small copies of the photos of a capture.
+    """Find out what a folder holds: reads names, and decodes small copies of a capture's photos to tell their roles.
 
     Raises:
         CaptureError, CalibrationError: the folder does not exist, or holds no input for a run.
