@@ -3,8 +3,8 @@
     python .ci/versions.py [--python python3.11 python3.13] [--ends oldest newest] [--keep DIR] [-- PYTEST ARGUMENTS]
 
 Each pair gets an environment of its own: the package with its tests, `pip check`, then the default set of tests (or
-what the arguments choose). One row each of benchmarks/results_versions.md says when it last passed, on which commit,
-with which versions; rows of other pairs stay. Exit code 1 if a pair fails: its row keeps the date at which it passed.
+what the arguments choose). One entry each of .ci/versions.json says when it last passed, on which commit, with which
+versions; those of other pairs stay. Exit code 1 if a pair fails: its entry keeps the date at which it passed.
 """
 
 import argparse
@@ -18,15 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-TABLE = ROOT / "benchmarks" / "results_versions.md"
-HEAD = """# Oldest and newest versions
-
-`python .ci/versions.py` makes an environment for each row, installs the package with its tests, runs `pip check` and
-the tests, and writes when they last passed. Oldest: the lower bound of each package that the program itself needs.
-
-| Python | packages | last passed | commit | tests | passed, skipped | versions |
-|---|---|---|---|---|---|---|
-"""
+KEPT = ROOT / ".ci" / "versions.json"
 SHOWN = ("numpy", "scipy", "torch", "numba", "opencv-contrib-python-headless", "viser", "trimesh", "scikit-image")
 ENDS = {"oldest": ["-c", "requirements-min.txt"], "newest": []}
 
@@ -38,26 +30,18 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, help="folder of the environments; by default they are removed")
     parser.add_argument("tests", nargs="*", help="arguments of pytest; by default the default set")
     options = parser.parse_args()
-    rows, failed = written_rows(), []
+    kept, failed = json.loads(KEPT.read_text()) if KEPT.exists() else {}, []
     for python in options.python:
         for end in options.ends:
             print(f"+ {python}, {end} packages", flush=True)
-            row = tried(python, end, options.tests, options.keep)
-            if row is None:
+            if passed := tried(python, end, options.tests, options.keep):
+                kept |= passed
+                KEPT.write_text(json.dumps(kept, indent=1, sort_keys=True) + "\n")
+            else:
                 failed.append(f"{python} with the {end} packages")
-                continue
-            rows[row[0], end] = row
-            TABLE.write_text(HEAD + "".join(f"| {' | '.join(rows[key])} |\n" for key in sorted(rows)))
     for text in failed:
         print(f"failed: {text}", file=sys.stderr)
     return bool(failed)
-
-
-def written_rows() -> dict[tuple[str, str], list[str]]:
-    """The rows of the table, by Python's version and end."""
-    lines = TABLE.read_text().splitlines() if TABLE.exists() else []
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if re.match(r"\| \d", line)]
-    return {(row[0], row[1]): row for row in rows}
 
 
 def build_requires() -> list[str]:
@@ -65,8 +49,8 @@ def build_requires() -> list[str]:
     return tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]["requires"]
 
 
-def tried(python: str, end: str, tests: list[str], keep: Path | None) -> list[str] | None:
-    """Install and test one pair; its row, or None if something failed, which has been printed."""
+def tried(python: str, end: str, tests: list[str], keep: Path | None) -> dict[str, dict]:
+    """Install and test one pair; its entry, or none if something failed, which has been printed."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = (keep or Path(temporary)) / f"{Path(python).name}-{end}"
         own = folder / ("Scripts" if sys.platform == "win32" else "bin") / "python"
@@ -79,7 +63,7 @@ def tried(python: str, end: str, tests: list[str], keep: Path | None) -> list[st
         ]
         for step in steps:
             if subprocess.run(step, cwd=ROOT, check=False).returncode:
-                return None
+                return {}
         done = subprocess.run(
             [str(own), "-m", "pytest", "-v", "--tb=short", *tests],
             cwd=ROOT,
@@ -89,16 +73,15 @@ def tried(python: str, end: str, tests: list[str], keep: Path | None) -> list[st
         )
         print(done.stdout[-3000:], flush=True)
         if done.returncode:
-            return None
+            return {}
         counts = ", ".join(re.findall(r"\d+ (?:passed|skipped)", done.stdout.splitlines()[-1]))
         listed = subprocess.run([str(own), "-m", "pip", "list", "--format=json"], capture_output=True, check=True)
         found = {package["name"]: package["version"] for package in json.loads(listed.stdout)}
         said = subprocess.run([str(own), "-V"], capture_output=True, text=True, check=True).stdout.split()[1]
     commit = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True)
-    versions = ", ".join(f"{name} {found[name]}" for name in SHOWN)
-    when = datetime.now(UTC).date().isoformat()
-    chosen = " ".join(tests) or "default set"
-    return [".".join(said.split(".")[:2]), end, when, commit.stdout.strip(), chosen, counts, versions]
+    entry = {"passed": datetime.now(UTC).date().isoformat(), "commit": commit.stdout.strip(), "counts": counts}
+    entry |= {"tests": " ".join(tests) or "default set", "versions": {name: found[name] for name in SHOWN}}
+    return {f"{'.'.join(said.split('.')[:2])} {end}": entry}
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from scipy import stats
-from sheet import ROOT, Sheet, down, parser_of, table
+from sheet import ROOT, Sheet, parser_of, table
 
 # isort: split
 from bed_draws import Draw, draw
@@ -219,17 +219,14 @@ def interval(values: Sequence[float], of=np.median) -> str:
     return f"{of(values):.3g} ({found.low:.3g} to {found.high:.3g})"
 
 
-def summary(rows: Sequence[Row], name: str) -> list[object]:
+def summary(rows: Sequence[Row], name: str) -> Row:
     """Return one line: name, captures, the three shares, the median of CPU seconds and the largest."""
-    shares = [share([row["outcome"] == outcome for row in rows]) for outcome in OUTCOMES]
+    shares = {outcome: share([row["outcome"] == outcome for row in rows]) for outcome in OUTCOMES}
     cpu = [row["cpu_s"] for row in rows]
-    return [name, len(rows), *shares, interval(cpu), round(max(cpu))]
+    return {"": name, "captures": len(rows)} | shares | {"CPU s, median": interval(cpu), "largest": round(max(cpu))}
 
 
-HEAD = ["", "captures", *OUTCOMES, "CPU s, median", "largest"]
-
-
-def by_factor(rows: Sequence[Row], fewest: int) -> list[str]:
+def by_factor(rows: Sequence[Row], fewest: int) -> list[Row]:
     """Return the four numbers of each value of each factor that has enough captures."""
     lines = []
     for factor in ("kind", "object", "material", "size", "table", "pictures", "wall", "room light", "lights", "photos",
@@ -238,7 +235,7 @@ def by_factor(rows: Sequence[Row], fewest: int) -> list[str]:
             cell = [row for row in rows if row[factor] == value]
             if len(cell) >= fewest:
                 lines.append(summary(cell, f"{factor}: {value}"))
-    return table(HEAD, lines)
+    return lines
 
 
 def singles(rows: Sequence[Row]) -> list[str]:
@@ -251,10 +248,10 @@ def singles(rows: Sequence[Row]) -> list[str]:
         raise SystemExit(f"seeds from {FIRST_UNSEEN} on are not looked into one by one: only their numbers decide.")
     shown = ("outcome", *LIMITS, "bad_used", "grade", "causes", "said", "cpu_s", "object", "material", "table", "size",
              "pictures", "wall", "lights", "room light", "photos", "bad photos", "key")  # fmt: skip
-    return down([{"capture": f"{r['kind']} {r['seed']}"} | {k: r.get(k) for k in shown} for r in rows], "capture")
+    return table([{"capture": f"{r['kind']} {r['seed']}"} | {k: r.get(k) for k in shown} for r in rows])
 
 
-def compared(a: Sequence[Row], b: Sequence[Row]) -> list[str]:
+def compared(a: Sequence[Row], b: Sequence[Row]) -> list[Row]:
     """Return the paired differences of the same captures: b less a for shares, b over a for CPU seconds."""
     other = {(row["kind"], row["key"]): row for row in b}
     pairs = [(row, other[row["kind"], row["key"]]) for row in a if (row["kind"], row["key"]) in other]
@@ -263,8 +260,9 @@ def compared(a: Sequence[Row], b: Sequence[Row]) -> list[str]:
         if some:
             is_one = [[[row["outcome"] == one for row in pair] for pair in some] for one in OUTCOMES]
             shares = [interval([float(y) - float(x) for x, y in found], np.mean) for found in is_one]
-            lines.append([name, len(some), *shares, interval([y["cpu_s"] / x["cpu_s"] for x, y in some])])
-    return table(["second less first", "captures", *OUTCOMES, "CPU s, second over first"], lines)
+            line = {"second less first": name, "captures": len(some)} | dict(zip(OUTCOMES, shares, strict=True))
+            lines.append(line | {"CPU s, second over first": interval([y["cpu_s"] / x["cpu_s"] for x, y in some])})
+    return lines
 
 
 def main() -> None:
@@ -284,13 +282,12 @@ def main() -> None:
     last, options.cache = options.seed + options.count - 1, options.cache.resolve()
     if options.seed < FIRST_UNSEEN <= last:
         raise SystemExit(f"seeds below {FIRST_UNSEEN} and from there on are two beds: ask for one of them at a time.")
-    title = f"The bed, {options.preset}"
-    page = Sheet(title, options.table, f"captures {options.seed} to {last} of each kind: {', '.join(options.kind)}")
+    seeds = f"captures {options.seed} to {last} of each kind: {', '.join(options.kind)}, {options.preset}"
     if options.compare:
         commits = [git(ROOT, "rev-parse", f"{name}^{{commit}}").strip()[:12] for name in options.compare]
         both = [results(options, None, commit) for commit in commits]
         own = [summary(rows, commit) for rows, commit in zip(both, commits, strict=True)]
-        page.write(table(HEAD, own), compared(*both))
+        Sheet(None, seeds).write(own, table(compared(*both)))
         return
     commit = commit_of(options.tree)
     rows = results(options, options.tree.resolve(), commit)
@@ -298,8 +295,8 @@ def main() -> None:
         raise SystemExit(f"none of these captures is kept for {commit}: run them without --kept.")
     kinds = [summary([row for row in rows if row["kind"] == kind], kind) for kind in sorted({r["kind"] for r in rows})]
     is_unseen = last >= FIRST_UNSEEN
-    parts = [table(HEAD, [*kinds, summary(rows, "all")]), by_factor(rows, FEWEST if is_unseen else 1)]
-    page.write([f"Program: {commit}"], *parts, *([] if is_unseen else [singles(rows)]))
+    parts = [*kinds, summary(rows, "all"), *by_factor(rows, FEWEST if is_unseen else 1)]
+    Sheet(options.table, f"{seeds}; program {commit}").write(parts, *([] if is_unseen else [singles(rows)]))
 
 
 if __name__ == "__main__":

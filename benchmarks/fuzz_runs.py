@@ -6,7 +6,7 @@ The runs are those of tests/damaged_runs.py: every file that a run may hold, of 
 several views with the object laid anew. One of the files, sometimes two, is damaged byte by byte or by its structure,
 and one command reads the folder, in a process of its own with 2 GB of memory and 20 s of computing: a fork of this one,
 which has imported what the commands import. --fresh folders more are read by command lines as a user types them, in new
-interpreters. Writes a Markdown table; exit code 1 for any traceback, signal, hang, flood of memory, file read or
+interpreters. Exit code 1 for any traceback, signal, hang, flood of memory, file read or
 written elsewhere, and text of the folder that becomes markup.
 """
 
@@ -29,7 +29,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fuzz_commands import COMMANDS, FRESH
-from sheet import ROOT, Sheet, down, parser_of
+from sheet import ROOT, Sheet, parser_of
 
 # isort: split
 import confined  # pyright: ignore[reportMissingImports]
@@ -183,7 +183,7 @@ def main() -> int:
     options = parser.parse_args()
     if os.environ.get(THREADS[0]) != "1":  # this process forks, and must have no threads
         os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | dict.fromkeys(THREADS, "1"))
-    sheet = Sheet("Damaged run folders", options.table, f"seed {options.seed}, from folder {options.first}")
+    sheet = Sheet(options.table, f"seed {options.seed}, from folder {options.first}")
     tally = Tally()
     end = time.monotonic() + options.seconds
     with tempfile.TemporaryDirectory() as name:
@@ -210,7 +210,7 @@ def main() -> int:
             shutil.rmtree(case, ignore_errors=True)
             if number % 100 == 99:
                 print(number + 1, tally.total(), file=sys.stderr, flush=True)
-    sheet.write(tally.table())
+    sheet.write(tally.rows())
     return int(not tally.is_well())
 
 
@@ -234,10 +234,10 @@ class Tally:
         """Each ended in a result or in a sentence."""
         return set(self.total()) <= set(WELL)
 
-    def table(self) -> list[str]:
+    def rows(self) -> list[dict]:
         """One row for each command, and one for all."""
         rows = [_row(command, found, self._slowest[command]) for command, found in sorted(self._counts.items())]
-        return down([*rows, _row("together", self.total(), max(self._slowest.values(), default=0.0))], "command")
+        return [*rows, _row("together", self.total(), max(self._slowest.values(), default=0.0))]
 
 
 def _damaged_case(work: Path, number: int, draw: random.Random) -> tuple[Path, str]:

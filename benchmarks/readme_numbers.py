@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from one_run import COW, SPOT, run
-from sheet import ROOT, Sheet, parser_of, table
+from sheet import ROOT, Sheet, parser_of
 
 # isort: split
 from capture.session.session import ADVISED_LIT
@@ -105,15 +105,16 @@ def main() -> int:
     options = parser.parse_args()
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     wrong = unknown(readme) + contradicted(readme)
-    sheet = Sheet("The numbers of README.md", options.table, "seed 0")
+    sheet = Sheet(options.table, "seed 0")
     found, rows = measure(), []
     for one in MEASURED:
         value = found.get(one.name)
         holds = value is None or abs(value - one.stated) <= one.tolerance * one.stated
         verdict = "not judged: the machine was busy" if value is None else "holds" if holds else "is off"
-        rows.append([one.name, one.stated, value, f"{one.tolerance:.0%}", verdict])
+        told = {"number": one.name, "README": one.stated, "measured": value}
+        rows.append(told | {"may be off by": f"{one.tolerance:.0%}", "verdict": verdict})
         wrong += [] if holds else [f"{one.name}: {one.stated:g} stated, {value:.3g} measured"]
-    sheet.write(table(["number", "README", "measured", "may be off by", ""], rows), [f"- {line}" for line in wrong])
+    sheet.write(rows, [f"- {line}" for line in wrong])
     return int(bool(wrong))
 
 

@@ -1,4 +1,4 @@
-"""Find boards in hard synthetic photos and in real ones, and write what came out as a Markdown table.
+"""Find boards in hard synthetic photos and in real ones, and say how well.
 
     python benchmarks/run_boards.py [--photos 2000] [--first 0] [--real FOLDER] [--table FILE]
 
@@ -16,7 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from sheet import Sheet, across, parser_of
+from sheet import Sheet, parser_of, table
 
 # isort: split
 from hard_board_photos import LENSES, SIZE, HardPhoto, hard_photo  # pyright: ignore[reportMissingImports]
@@ -99,7 +99,7 @@ def outcome(seed: int, cameras: list[Camera]) -> Outcome:
 
 
 def summary(name: str, outcomes: list[Outcome]) -> dict:
-    """One column of the table."""
+    """One row of the table."""
     found = [one for one in outcomes if one.found]
     if not found:
         return {"capture": name, "photos": len(outcomes), "found, %": 0.0}
@@ -119,8 +119,8 @@ def summary(name: str, outcomes: list[Outcome]) -> dict:
     }
 
 
-def synthetic(first: int, n_photos: int) -> list[str]:
-    """Tables over all photos, those of the envelope, and by board and tilt."""
+def synthetic(first: int, n_photos: int) -> tuple[list[dict], list[str]]:
+    """Rows over all photos, those of the envelope, and by board and tilt."""
     cameras = [calibrated(lens) for lens in range(len(LENSES))]
     outcomes = [outcome(seed, cameras) for seed in range(first, first + n_photos)]
     tilts = (10, 30, 50, 60, 70, 80)
@@ -130,13 +130,12 @@ def synthetic(first: int, n_photos: int) -> list[str]:
         groups.append((f"{low}-{high} deg", [o for o in outcomes if low <= o.photo.conditions.tilt < high]))
     focal = [100 * abs(c.fx / lens.fx - 1) for c, lens in zip(cameras, LENSES, strict=True)]
     missed = [one for one in outcomes if one.in_envelope() and not one.found]
-    lines = across([summary(name, group) for name, group in groups if group])
-    lines += ["", f"Focal lengths of the calibrated cameras are off by {max(focal):.3f} % at most."]
+    lines = [f"Focal lengths of the calibrated cameras are off by {max(focal):.3f} % at most."]
     lines += [f"Missed inside the envelope: {one.photo.board.kind}, {one.photo.conditions}" for one in missed[:20]]
-    return lines
+    return [summary(name, group) for name, group in groups if group], lines
 
 
-def real(folder: Path) -> list[str]:
+def real(folder: Path) -> list[dict]:
     """What is found in real photos, with the board named and without."""
     rows = []
     for name, spec in REAL.items():
@@ -162,7 +161,7 @@ def real(folder: Path) -> list[str]:
             if corners is None:
                 missing.append(path.name)
         rows.append({"capture": name, **counts, "CPU s, largest": slowest, "not found": missing})
-    return across(rows)
+    return rows
 
 
 def _either_way(size: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -178,11 +177,9 @@ def main() -> None:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     seeds = f"seeds {arguments.first} to {arguments.first + arguments.photos - 1}"
-    sheet = Sheet("Boards in hard photos", arguments.table, seeds)
-    parts = synthetic(arguments.first, arguments.photos) if arguments.photos else []
-    if arguments.real:
-        parts += ["", *real(arguments.real)]
-    sheet.write(parts)
+    sheet = Sheet(arguments.table, seeds)
+    rows, lines = synthetic(arguments.first, arguments.photos) if arguments.photos else ([], [])
+    sheet.write(rows, lines, table(real(arguments.real)) if arguments.real else [])
 
 
 if __name__ == "__main__":

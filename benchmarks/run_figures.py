@@ -118,7 +118,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     note = f"Preset {options.preset}; {options.left_out} photos left out of the second run."
-    Sheet("Figures under known distant lights", options.table, f"seed {options.seed}", note).fill(rows(options), "set")
+    Sheet(options.table, f"seed {options.seed}", note).fill(rows(options))
 
 
 if __name__ == "__main__":

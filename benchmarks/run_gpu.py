@@ -3,7 +3,7 @@
     python benchmarks/run_gpu.py                                    on a machine with CUDA: 800 px, 100 lights, fine
     python benchmarks/run_gpu.py --device torch-cpu --width 120 --lights 12 --preset draft     anywhere, in a minute
 
-Writes a Markdown table to --table. The scene, two balls and a box on a table, is rendered exactly: tests/synthetic.py.
+The scene, two balls and a box on a table, is rendered exactly: tests/synthetic.py.
 Tables: each grid's gradient, step and seconds by either; whole solves by either against the truth; and how far apart
 the two surfaces are, seen by the camera.
 """
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import torch
-from sheet import Sheet, down, parser_of, table
+from sheet import Sheet, parser_of, table
 from solves import LOOK, Subject, as_truth, scene_of, score, seen, shown, synthetic
 
 from reconstruct.config import FitConfig
@@ -71,7 +71,7 @@ def seconds_each(work: Callable[[int], object], device: torch.device, count: int
     return (time.perf_counter() - start) / count
 
 
-def compare_level(scene: Scene, device: torch.device, config: FitConfig, nodes: int) -> list[object]:
+def compare_level(scene: Scene, device: torch.device, config: FitConfig, nodes: int) -> dict:
     """One grid: gradients and steps of both backends on the same rays, then seconds per iteration and memory."""
     observer = Observer(scene)
     begin = choose_start(scene, observer, config)
@@ -107,7 +107,9 @@ def compare_level(scene: Scene, device: torch.device, config: FitConfig, nodes: 
     cpu = seconds_each(iterate(kernel, by_kernels), device, TIMED)
     gpu = seconds_each(iterate(moving, by_torch), device, TIMED)
     memory = torch.cuda.max_memory_allocated() / MIB if device.type == "cuda" else "not measured"
-    return [nodes, len(rays.pixels), float(apart), float(step / moved), cpu, gpu, cpu / gpu, memory]
+    row = {"nodes": nodes, "pixels": len(rays.pixels), "gradient, relative difference": float(apart)}
+    row |= {"step, relative difference": float(step / moved), "kernels, s": cpu, "torch, s": gpu, "ratio": cpu / gpu}
+    return row | {"GPU memory, MiB": memory}
 
 
 def solve(subject: Subject, scene: Scene, config: FitConfig, device: torch.device | None) -> tuple[dict, Fields]:
@@ -139,23 +141,22 @@ def main() -> None:
     what = f"{options.width} x {height} px, {options.lights} lights, {options.input}"
     against = f"{backend_name(device)} against {backend_name(None)}"
     note = f"{against}. Scene: {what}; preset {options.preset}."
-    sheet = Sheet("Torch backend", options.table, "seed 0", note)
-    head = ["nodes", "pixels", "gradient, relative difference", "step, relative difference"]
-    head += ["kernels, s per iteration", "torch, s per iteration", "ratio", "GPU memory, MiB"]
-    parts = [table(head, [compare_level(scene, device, config, nodes) for nodes in grids])]
-    sheet.write(*parts)
+    sheet = Sheet(options.table, "seed 0", note)
+    size, parts = {"scene": f"{what}, {options.preset}"}, []
+    levels = [size | compare_level(scene, device, config, nodes) for nodes in grids]
+    sheet.write(levels)
     if options.no_solve:
         return
     solves = [solve(subject, scene, config, device)]
     solves += [] if options.no_cpu_solve else [solve(subject, scene, config, None)]
     again = solve(subject, scene, config, device)[1]
-    parts.append(down([row for row, _ in solves], "whole solve"))
+    parts.append(table([row for row, _ in solves]))
     if len(solves) > 1:
         reference = as_truth(solves[1][1], subject.calibration)
         apart = shown(compare_views(reference, seen(solves[0][1], reference), None))
-        parts.append(["How far apart the two solves are:", "", *down([{"": against} | apart], "")])
+        parts.append(["How far apart the two solves are:", "", *table([{"": against} | apart])])
     same = torch.equal(again.grid.values, solves[0][1].grid.values)
-    sheet.write(*parts, [f"A second solve by torch ends in {'the same' if same else 'other'} bits."])
+    sheet.write(levels, *parts, [f"A second solve by torch ends in {'the same' if same else 'other'} bits."])
 
 
 if __name__ == "__main__":

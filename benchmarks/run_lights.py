@@ -1,11 +1,11 @@
 """How well flashlights are found: simulated tables with one fault each, and captures scored against their gt/.
 
     python benchmarks/run_lights.py [--photos 30] [--seeds 1] [--cases CASE...] [--captures CAPTURE@BOARD...]
-        [--ways shading phone] [--counts 20 40 160] [--table FILE]
+        [--ways shading phone] [--table FILE]
 
 Errors are in per cent of the light's distance from the object; "inside" is the share of coordinates within 1.96 stated
 sigmas. The photos of the simulated cases are those of tests/flashlight_photos.py. The way "phone" is taken where a
-capture has photos of the phone that held the light. A second table: what the fit alone costs for --counts photos.
+capture has photos of the phone that held the light.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from sheet import Sheet, cpu_of, down, parser_of
+from sheet import Sheet, cpu_of, parser_of
 
 # isort: split
 from flashlight_photos import POSED_CAMERA, Recipe, photograph  # pyright: ignore
@@ -47,7 +47,7 @@ def row(name: str, errors: np.ndarray, inside: np.ndarray, dropped: int, seconds
     """One line of the table."""
     measures = np.median(errors), np.percentile(errors, 90), errors.max(), inside.mean()
     named = zip(("median, %", "p90, %", "worst, %", "inside"), map(float, measures), strict=True)
-    return {"": name, **dict(named), "dropped": dropped, "CPU s": seconds}
+    return {"photos": name, **dict(named), "dropped": dropped, "CPU s": seconds}
 
 
 def simulated(name: str, photos: int, seeds: int) -> dict:
@@ -71,7 +71,7 @@ def capture(named: str, way: str) -> dict:
         options = ["--force", "--lights", way, *(["--board", board] if board else [])]
         ended = subprocess.run([*COMMAND, "calibrate", place, "--out", out, *options], check=False, capture_output=True)
         if ended.returncode:
-            return {"": f"{Path(place).name}, {way}: refused"}
+            return {"photos": f"{Path(place).name}, {way}: refused"}
         calibration = load_calibration(Path(out) / "calibration.json")
     spent = cpu_of(resource.RUSAGE_CHILDREN) - before
     truth = load_capture_truth(Path(place), calibration.camera.width, calibration.camera.height)
@@ -95,15 +95,6 @@ def capture(named: str, way: str) -> dict:
     return found | {"direction, degrees": float(np.degrees(np.median(turns))), "bad photos used": int(kept)}
 
 
-def fit_cost(photos: int) -> dict:
-    """CPU seconds of the fit of so many clean photos, without making them, and its error."""
-    truth = photograph(Recipe(n_photos=photos), 0)
-    start = time.process_time()
-    found = locate_lights(truth.stack, POSED_CAMERA, np.ones(photos, bool)).lights
-    spent = time.process_time() - start
-    return {"photos": photos, "CPU s of the fit": spent, "median, %": float(np.median(100 * truth.errors(found)))}
-
-
 def rows(options: argparse.Namespace) -> Iterator[dict]:
     """Every simulated case, then every capture in the ways it allows."""
     for name in options.cases:
@@ -122,17 +113,9 @@ def main() -> None:
     parser.add_argument("--cases", nargs="*", default=list(FAULTS), choices=list(FAULTS))
     parser.add_argument("--captures", nargs="*", default=[])
     parser.add_argument("--ways", nargs="*", default=["shading"], choices=["shading", "phone"])
-    parser.add_argument("--counts", nargs="*", type=int, default=[20, 40, 160], help="photos, to see what they cost")
     options = parser.parse_args()
-    note = "Errors in per cent of the light's distance; inside: share of coordinates within 1.96 stated sigmas."
     seeds = f"seeds 0 to {options.seeds - 1}"
-    sheet, found = Sheet("Flashlights", options.table, seeds, note), []
-    for one in rows(options):
-        found.append(one)
-        sheet.write(down(found, ""))
-    costs = [fit_cost(count) for count in options.counts]
-    if costs:
-        sheet.write(down(found, ""), ["What the fit costs, clean photos:", "", *down(costs, "photos")])
+    Sheet(options.table, seeds).fill(rows(options))
 
 
 if __name__ == "__main__":

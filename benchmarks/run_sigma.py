@@ -51,21 +51,20 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=2000, help="lengths of each run")
     parser.add_argument("--plot", type=Path)
     options = parser.parse_args()
-    note = "Errors and sigmas: medians, mm, of volumes cm3. Wanted shares: 0.60 to 0.80, 0.90 to 0.98, from 0.985."
-    sheet = Sheet(
-        "Stated uncertainty of surfaces, lengths and volumes", options.table, f"{len(options.runs)} runs", note
-    )
     named = [one.partition("=") for one in options.runs]
     found = [measured(Path(capture), Path(run), options.pairs) for capture, _, run in named]
-    rows = [row for one in found for row in _rows(one)]
-    sheet.write(table(["run", "of", "number", "error", "sigma", "within 1", "2", "3"], [*rows, *_together(found)]))
+    single = [row for one in found for row in _rows(one)]
+    Sheet(options.table, f"{len(options.runs)} runs").write(_together(found), table(single))
     if options.plot:
         _draw(found, options.plot)
 
 
-def _rows(one: Measured) -> list[list[object]]:
+def _rows(one: Measured) -> list[dict]:
+    """Return a run's rows: medians of errors and sigmas in mm, of volumes cm3, and the shares within 1, 2, 3 sigmas."""
     return [
-        [one.name, what, len(off), np.median(np.abs(one.errors[what])), np.median(one.sigmas[what]), *_shares(off)]
+        {"run": one.name, "of": what, "number": len(off), "error": float(np.median(np.abs(one.errors[what])))}
+        | {"sigma": float(np.median(one.sigmas[what]))}
+        | _named(_shares(off))
         for what, off in one.in_sigmas.items()
     ]
 
@@ -74,11 +73,15 @@ def _shares(off: np.ndarray) -> list[float]:
     return [float((np.abs(off) < k).mean()) for k in (1, 2, 3)]
 
 
-def _together(found: list[Measured]) -> list[list[object]]:
-    rows: list[list[object]] = []
+def _named(shares: list[float]) -> dict:
+    return dict(zip(("within 1", "within 2", "within 3"), shares, strict=True))
+
+
+def _together(found: list[Measured]) -> list[dict]:
+    rows = []
     for what in dict.fromkeys(name for one in found for name in one.in_sigmas):
         shares = [_shares(one.in_sigmas[what]) for one in found if what in one.in_sigmas]
-        rows.append(["mean of the runs", what, len(shares), "", "", *np.mean(shares, axis=0).tolist()])
+        rows.append({"of": what, "runs": len(shares)} | _named(np.mean(shares, axis=0).tolist()))
     return rows
 
 

@@ -10,15 +10,15 @@ whose load is printed, slows the clock, not these.
 """
 
 import io
-import os
+import shutil
 import time
 from pathlib import Path
 
 import numpy as np
 import psutil
 from PIL import Image
-from run_viewer import chromium
-from sheet import parser_of
+from playwright.sync_api import sync_playwright
+from sheet import Sheet, parser_of
 
 from viewer.page.guard import GuardedServer
 from viewer.stage.files import StageFiles
@@ -26,6 +26,7 @@ from viewer.stage.files import StageFiles
 WINDOWS = ({"width": 800, "height": 600}, {"width": 390, "height": 844}, {"width": 1600, "height": 1000})
 MOVES, PAUSE_S = 60, 0.03
 TIMEOUT_S = 120.0
+SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 READY = "Boolean(window.shadowgraph && shadowgraph.pace.firstPaint)"
 DIFFERS = 40  # sum over the channels
 
@@ -87,8 +88,8 @@ def moved(tab, window: dict[str, int], drags: bool) -> tuple[float, float, float
     return float(np.median(waits)), frames / seconds, spent / max(frames, 1)
 
 
-def measured(browser, address: str, window: dict[str, int]) -> str:
-    """Return the table's line for a window of this size."""
+def measured(browser, address: str, window: dict[str, int]) -> dict:
+    """Return the row of a window of this size."""
     tab = browser.new_page(viewport=window)
     tab.goto(address)
     wait_for(tab, READY)
@@ -97,10 +98,9 @@ def measured(browser, address: str, window: dict[str, int]) -> str:
     tab.keyboard.press("Home")
     share = filled(tab, window)
     tab.close()
-    cells = f"{paint:.2f} s | {share:.0%} | {pointer:.0f} ms | {rate:.0f} a second"
-    load = f"{os.getloadavg()[0]:.1f} on {os.cpu_count()}"
-    size = f"{window['width']} x {window['height']}"
-    return f"| {size} | {cells} | {1000 * lit:.0f} / {1000 * turned:.0f} ms | {load} |"
+    row = {"window": f"{window['width']} x {window['height']}", "first paint, s": paint, "object fills": share}
+    row |= {"pointer to picture, ms": pointer, "orbit, pictures a second": rate}
+    return row | {"light, CPU ms": 1000 * lit, "orbit, CPU ms": 1000 * turned}
 
 
 def main() -> None:
@@ -111,16 +111,13 @@ def main() -> None:
     files = StageFiles(asked.run, "socket")
     files.warm()
     server = GuardedServer("127.0.0.1", 0, files)
-    lines = ["| window | first paint | object fills | pointer to picture | orbit | CPU, light / orbit | load |"]
-    lines += ["|---|---|---|---|---|---|---|"]
-    print("\n".join(lines), flush=True)
-    with chromium() as browser:
-        for window in WINDOWS:
-            lines.append(measured(browser, f"http://localhost:{server.get_port()}/stage/", window))
-            print(lines[-1], flush=True)
+    path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
+    address = f"http://localhost:{server.get_port()}/stage/"
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", *SOFTWARE_GL])
+        Sheet(asked.table, "nothing random").fill(measured(browser, address, window) for window in WINDOWS)
+        browser.close()
     server.stop()
-    if asked.table is not None:
-        asked.table.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from sheet import ROOT, Sheet, table
+from sheet import ROOT, Sheet, parser_of
 
 # isort: split
 from capture_faults import FAMILIES, MOVED, Case, Original, draw, original, save, smaller
@@ -64,13 +64,12 @@ class Outcome:
 
 def main() -> int:
     """Draw, check, count, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("captures", nargs="*", default=[str(ROOT / "examples" / "spot")])
     parser.add_argument("--cases", type=int, default=13, help="of each family")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--long-side", type=int, default=504, help="px, to which photos are reduced first")
     parser.add_argument("--only", default="", help="families with this in their name")
-    parser.add_argument("--table", type=Path)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="originals_") as work:
         places = [Path(work) / str(number) for number in range(len(options.captures))]
@@ -81,7 +80,7 @@ def main() -> int:
 
 
 def _measure(options: argparse.Namespace, originals: list[Original]) -> int:
-    sheet = Sheet("Faults in captures: found and named", options.table, f"seed {options.seed}", NOTE)
+    sheet = Sheet(options.table, f"seed {options.seed}", NOTE)
     families = [family for family in ("untouched", *FAMILIES) if options.only in family]
     outcomes: list[Outcome] = []
     for repeat in range(options.cases):  # all families in turn: a run that is stopped has seen each as often
@@ -151,15 +150,15 @@ def _rate(group: list[Outcome]) -> float:
     return sum(outcome.named for outcome in group) / len(group)
 
 
-def _summary(outcomes: list[Outcome]) -> list[str]:
-    head = ["fault", "size", "cases", "found and named", "goes on as it should", "good photos accused", "CPU s a case"]
+def _summary(outcomes: list[Outcome]) -> list[dict]:
     rows = []
     for (family, size), group in _grouped(outcomes).items():
         n, good = len(group), sum(len(o.case.chosen) - len(o.case.bad) for o in group)
         parts = [f"{sum(o.named for o in group)} of {n}", f"{sum(o.goes_on for o in group)} of {n}"]
-        accused = f"{sum(o.accused for o in group)} of {good}"
-        rows.append([family, size, n, *parts, accused, float(np.mean([o.seconds for o in group]))])
-    return table(head, rows)
+        told = dict(zip(("found and named", "goes on as it should"), parts, strict=True))
+        accused = {"accused": f"{sum(o.accused for o in group)} of {good}"}
+        rows.append({"fault": family, "size": size} | told | accused)
+    return rows
 
 
 def _misses(outcomes: list[Outcome]) -> list[str]:

@@ -4,7 +4,7 @@
 
 Pictures are those of tests/fuzz_images.py. Scene files are those of a scene with known lights, of files of lights, of
 settings and of results, one of which is cut, changed in some bytes or, where it is JSON, in one value. Each batch is
-read in a process of its own under a limit of memory and time. Writes a Markdown table; exit code 1 for any traceback,
+read in a process of its own under a limit of memory and time. Exit code 1 for any traceback,
 crash, hang or flood, and for a refusal that does not name its file.
 """
 
@@ -23,7 +23,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from sheet import ROOT, Sheet, down, parser_of
+from sheet import ROOT, Sheet, parser_of
 
 # isort: split
 from confined import limited  # pyright: ignore[reportMissingImports]
@@ -178,14 +178,14 @@ def main() -> int:
     if options.batch:
         batch(options.batch[0], int(options.batch[1]), int(options.batch[2]), options.seed)
         return 0
-    sheet, rows, is_well = Sheet("Damaged files", options.table, f"seed {options.seed}"), [], True
+    sheet, rows, is_well = Sheet(options.table, f"seed {options.seed}"), [], True
     for kind in ("pictures", "scenes"):
         counts, slowest, _ = run_batches(kind, getattr(options, kind), options.seed)
         others = sum(counts.values()) - counts["read"] - counts["refused"]
         is_well &= others == 0
         row = {"files": kind, "read": counts["read"], "refused by name": counts["refused"]}
         rows.append(row | {"anything else": others, "slowest s": slowest})
-        sheet.write(down(rows, "files"))
+        sheet.write(rows)
     return int(not is_well)
 
 

@@ -4,7 +4,7 @@
 
 The wheel is built from the last commit. Each Python gets a virtual environment of its own, into which pip installs the
 wheel with what it needs, from wherever pip is told to look; then the README's run of examples/spot, its kernels not
-compiled yet. Writes a Markdown table; exit code 1 where an install takes more than 5 minutes, a first result more than
+compiled yet. Exit code 1 where an install takes more than 5 minutes, a first result more than
 10, or one fails.
 """
 
@@ -19,7 +19,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from sheet import ROOT, Sheet, cpu_seconds, down, parser_of
+from sheet import ROOT, Sheet, cpu_seconds, parser_of
 
 SUPPORTED = ("python3.11", "python3.12", "python3.13")
 INSTALL_S, RESULT_S = 300.0, 600.0
@@ -32,14 +32,14 @@ def main() -> int:
     parser.add_argument("--python", nargs="+", default=list(SUPPORTED), help="programs to make environments with")
     options = parser.parse_args()
     note = "Seconds of wall time and of CPU; the bars are 5 minutes to install, 10 to the first result."
-    sheet, rows = Sheet("Install and first result", options.table, "no seed", note), []
+    sheet, rows = Sheet(options.table, "no seed", note), []
     work = Path(tempfile.mkdtemp(prefix="install_"))
     try:
         wheel = build(work)
         for program in options.python:
             if subprocess.run([program, "--version"], capture_output=True, check=False).returncode == 0:
                 rows.append(installed(program, wheel, work))
-                sheet.write(down(rows, "Python"))
+                sheet.write(rows)
     except FileNotFoundError as error:
         print(f"{error.filename} is not on this machine; name the programs with --python.", file=sys.stderr)
         return 1

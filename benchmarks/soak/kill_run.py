@@ -27,7 +27,7 @@ import trimesh
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from sheet import ROOT, Sheet, parser_of, table
+from sheet import ROOT, Sheet, parser_of
 
 # isort: split
 from synthetic import HEAP, Look, render  # pyright: ignore[reportMissingImports]
@@ -38,7 +38,6 @@ from reconstruct.run.machine import kernels_are_compiled
 MOST_LOST_S, MOST_LOST_SHARE = 30.0, 0.02  # CPU seconds, or of the whole run: the larger one counts
 MOST_CHANGE = 0.01  # of the mesh's volume and of the median depth
 POLL_S = 0.01
-HEAD = ("killed in", "lost CPU s", "same depth, bit for bit", "volume changed by")
 MOST_IN_A_ROW = 8  # kills of one run, then it is left alone: else a run that is killed early each time never ends
 
 
@@ -51,10 +50,10 @@ class Outcome:
     is_same: bool  # depth.npy, bit for bit
     change: float  # relative, of the mesh's volume
 
-    def cells(self) -> list[str]:
-        """A row of the table, by HEAD."""
-        same = "yes" if self.is_same else "no"
-        return [", ".join(self.killed_in), f"{self.lost:.1f}", same, f"{self.change:.2%}"]
+    def row(self) -> dict:
+        """A row of the table."""
+        lost = {"killed in": list(self.killed_in), "lost CPU s": self.lost}
+        return lost | {"same depth, bit for bit": self.is_same, "volume changed by": f"{self.change:.2%}"}
 
     def is_well(self, whole: float) -> bool:
         """Within the bars, for a run that takes `whole` CPU seconds."""
@@ -150,7 +149,7 @@ def main() -> int:
     parser.add_argument("--cores", type=int, default=1)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    sheet = Sheet("Killed and given again", options.table, f"seed {options.seed}")
+    sheet = Sheet(options.table, f"seed {options.seed}")
     work = Path(tempfile.mkdtemp(prefix="kill_run_"))
     capture = (options.capture or small_scene(work / "scene")).resolve()
     if not kernels_are_compiled():
@@ -172,7 +171,7 @@ def main() -> int:
             continue
         outcomes.append(outcome)
         n_kills += len(outcome.killed_in)
-        sheet.write(begin, table(HEAD, [one.cells() for one in outcomes]), [_summary(outcomes, n_kills)])
+        sheet.write([one.row() for one in outcomes], begin, [_summary(outcomes, n_kills)])
     shutil.rmtree(work)
     return int(not all(outcome.is_well(straight) for outcome in outcomes))
 

@@ -26,7 +26,7 @@ import psutil
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from one_run import SPOT
-from sheet import ROOT, Sheet, down, parser_of
+from sheet import ROOT, Sheet, parser_of
 
 MOST_OFF = 0.2
 POLL_S = 0.1
@@ -97,7 +97,7 @@ def main() -> int:
     parser.add_argument("--limit-gb", type=float, default=8.0)
     parser.add_argument("--capture", type=Path)
     options = parser.parse_args()
-    sheet = Sheet("Many large photos", options.table, "seed 1 of the noise")
+    sheet = Sheet(options.table, "seed 1 of the noise")
     work = Path(tempfile.mkdtemp(prefix="large_"))
     capture, out = options.capture or work / "capture", work / "run"
     if not capture.exists():
@@ -112,7 +112,7 @@ def main() -> int:
     row = {"photos": options.photos, "megapixels": options.megapixels, "preset": options.preset}
     row |= {"limit GB": options.limit_gb, "exit code": code, "CPU s": seconds, "private peak GB": peak / 1e9}
     row |= {"predicted GB": predicted / 1e9, "off by": f"{off:+.0%}"}
-    sheet.write(down([row | {"resident peak by stage, GB": peaks, "said": plan.get("sentence")}], "photos"))
+    sheet.write([row | {"resident peak by stage, GB": peaks, "said": plan.get("sentence")}])
     shutil.rmtree(work)
     return int(code != 0 or not abs(off) <= MOST_OFF)
 

@@ -4,8 +4,8 @@
 
 One `shadowgraph view` follows a run folder in which the same run is made again and again with other seeds; a client
 opens the page's WebSocket anew every few seconds. Memory and open files of the page's process are sampled; warm-up is
-the first quarter. Runs are processes of their own: their peaks are compared, first to last. Writes a Markdown table;
-exit code 1 where the page's memory grows by more than 5 % or its open files by more than 2 after the warm-up.
+the first quarter. Runs are processes of their own: their peaks are compared, first to last.
+Exit code 1 where the page's memory grows by more than 5 % or its open files by more than 2 after the warm-up.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ from websockets.sync.client import connect
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from sheet import ROOT, Sheet, down, parser_of
+from sheet import ROOT, Sheet, parser_of
 
 # isort: split
 from kill_run import small_scene
@@ -94,7 +94,7 @@ def main() -> int:
     parser.add_argument("--capture", type=Path)
     parser.add_argument("--preset", default="draft")
     options = parser.parse_args()
-    sheet = Sheet("Hours with a page", options.table, "seeds from 0")
+    sheet = Sheet(options.table, "seeds from 0")
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
         capture = options.capture or small_scene(work / "scene")
@@ -107,7 +107,7 @@ def main() -> int:
     row = {"minutes": f"{samples[-1][0] / 60:.1f}", "runs": len(peaks), "visits answered": f"{answered} of {visits}"}
     row |= {"page MB: warm, at the end": f"{first / 1e6:.0f}, {last / 1e6:.0f}", "growth": f"{growth:+.1%}"}
     row |= {"open files": f"{handles[0]}, {handles[1]}", "run peaks MB": [f"{peak / 1e6:.0f}" for peak in peaks]}
-    sheet.write(down([row], "minutes"))
+    sheet.write([row])
     is_flat = growth <= MOST_GROWTH and handles[1] - handles[0] <= MOST_FILES
     return int(not is_flat or answered < visits)
 

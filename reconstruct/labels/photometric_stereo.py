@@ -117,7 +117,7 @@ def _explained(errors: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
     An underside in sight of lit ground looks like a dark plate that faces up and is lit in all photos; its lit rays
     would carve the object. Of the samples called lit in two rendered captures, less than 1 in 5,000 is not with a
     misfit below .25, 2 to 5 in 100 with 1 to 1.5, a fifth to a half with 3 to 5, and a third to two thirds beyond;
-    normals are 2, 5 to 9, 36 to 77 and 56 to 110 degrees off (docs/method.md).
+    normals are 2, 5 to 9, 36 to 77 and 56 to 110 degrees off.
     """
     scale = (errors.median() / USUAL_MISFIT).clamp(min=1.0)
     return ((UNEXPLAINED - errors / scale) / (UNEXPLAINED - EXPLAINED)).clamp(0, 1)

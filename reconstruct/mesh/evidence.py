@@ -53,7 +53,7 @@ def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Verte
     The last term, `lean`, is what lights do that are off together, which calibrated ones mostly are: an object sheared
     along the line of sight explains their shadows then (Belhumeur, Kriegman, Yuille, The bas-relief ambiguity, 1999).
     That moves a surface across itself the more it faces the camera; 0.5 is the mean over all directions. The numbers
-    were chosen on six solves of rendered captures (benchmarks/results_sigma.md). The scale of the
+    were chosen on six solves of rendered captures (benchmarks/run_sigma.py). The scale of the
     printed board is not included.
 
     Args:
@@ -89,7 +89,7 @@ def volume_sigma(mesh: trimesh.Trimesh) -> float | None:
 
     With A a vertex's share of the area, sigma^2 is the sum over the three kinds of evidence of (c sum A sigma)^2: what
     is seen and what shadows hold is off to one side together (c = 1), guessed parts partly to either (c = 0.4, measured
-    on ten solves of rendered captures, benchmarks/results_sigma.md).
+    on ten solves of rendered captures, benchmarks/run_sigma.py).
     """
     known = mesh.vertex_attributes
     if "evidence" not in known or "sigma" not in known:

@@ -57,7 +57,7 @@ def solver_device(name: str) -> torch.device | None:
 
     "auto" selects the kernels on every machine. It may select a GPU once a GPU has passed benchmarks/run_gpu.py: the
     same surface as the kernels, in less time. An H200 makes the same surface in as long as eight CPU cores need: an
-    iteration takes 2.5 times as long on small grids and half as long on large ones (benchmarks/results_torch.md).
+    iteration takes 2.5 times as long on small grids and half as long on large ones (docs/results.md).
 
     Args:
         name: "auto" and "cpu": the kernels; "cuda": torch on a GPU; "torch-cpu": the code of "cuda" on the CPU,

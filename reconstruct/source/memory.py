@@ -2,7 +2,7 @@
 
 The prediction is of private memory: the system can take back pages of mapped files (programs, photos that the run
 keeps). It is the largest of four peaks: reading photos, finding the board in a full photo, the solve, and the maps of
-the finished surface, which are as large as a photo. Measured on runs of two cores (docs/reliability.md).
+the finished surface, which are as large as a photo. Measured on runs of two cores, by benchmarks/soak/large.py.
 """
 
 from dataclasses import dataclass, replace
