@@ -2,9 +2,11 @@
 
     python docs/make_pictures.py runs/spot runs/cow
     python docs/make_pictures.py --together phones runs/spot_charuco runs/hard_table
+    python docs/make_pictures.py --steps examples/spot runs/spot
 
 Of one view: a photo, the mesh from two sides, depth and normals. Of several views and lies: a photo of each, and the
 mesh from all sides. Together: a row for each run, which ends with the view relit from a place where no lamp was.
+Steps: what the method page shows of one run, from photo and shadows to the relit view.
 """
 
 import argparse
@@ -21,6 +23,11 @@ from calibration.calibrated_views import load_views
 from calibration.calibration import Calibration
 from calibration.light import Light
 from reconstruct.export.relit import NewLight, write_relit
+from reconstruct.labels.observer import Observer
+from reconstruct.run.solve_stage import prepare_scene
+from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import read_photos
+from reconstruct.source.source import open_source
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.display.pictures import depth_picture, mesh_picture, normal_picture
 
@@ -95,6 +102,29 @@ def relit_panel(run: Path) -> Image.Image:
         return on_white(brightened(np.asarray(Image.open(file)))[crop_box(mask)])
 
 
+LIT, DARK, OBJECT = (250, 205, 90), (50, 70, 130), (235, 235, 235)  # colours of labels
+
+
+def steps(run: Path, capture: Path) -> list[Image.Image]:
+    """A photo, what is ground in light and in shadow in it, the hull, the surface, its normals, and the relit view."""
+    found, options = load_views(run / "calibration.json"), RunOptions(preset="standard")
+    source = open_source(capture, options)
+    scene = prepare_scene(source, read_photos(source, options), found, options)[0]
+    labels = Observer(scene).ground_labels()
+    used = [light.photo for light in found.first.lights if light.used]
+    lit = labels.visibility[used.index(shown_light(found.first).photo)].numpy() > 0.5
+    colours = np.where(lit[..., None], LIT, DARK)
+    colours[labels.mask.numpy() > 0.5] = OBJECT
+    mask = np.asarray(Image.open(run / "mask.png")) > 127
+    labelled = np.asarray(Image.fromarray(colours.astype(np.uint8)).resize(mask.shape[::-1]))[crop_box(mask)]
+    meshes = [trimesh.load_mesh(run / name, process=False) for name in ("hull.ply", "mesh.ply")]
+    eye = found.first.world_from_camera.translation - meshes[1].bounds.mean(0)
+    way = np.array([-eye[1], eye[0], 0.5 * eye[2]])
+    shapes = [on_white(mesh_picture(mesh, way, (400, 400))) for mesh in meshes]
+    normals = on_white(normal_picture(np.load(run / "normal.npy"), mask)[crop_box(mask)])
+    return [photo_panel(run, "", found.first, HEIGHT), on_white(labelled), *shapes, normals, relit_panel(run)]
+
+
 def shown_light(calibration: Calibration) -> Light:
     """The light whose photo is shown."""
     used = [light for light in calibration.lights if light.used]
@@ -147,7 +177,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--together", metavar="NAME", help="one picture of this name, a row for each run of one view")
+    parser.add_argument("--steps", metavar="CAPTURE", type=Path, help="steps.jpg of this capture's run")
     options = parser.parse_args()
+    if options.steps:
+        save([steps(options.runs[0], options.steps)], "steps")
+        return
     if options.together:
         save([[*panels(run)[0], relit_panel(run)] for run in options.runs], options.together)
         return
