@@ -180,7 +180,8 @@ def main() -> None:
     parser.add_argument("--steps", metavar="CAPTURE", type=Path, help="steps.jpg of this capture's run")
     options = parser.parse_args()
     if options.steps:
-        save([steps(options.runs[0], options.steps)], "steps")
+        parts = steps(options.runs[0], options.steps)
+        save([parts[:3], parts[3:]], "steps")
         return
     if options.together:
         save([[*panels(run)[0], relit_panel(run)] for run in options.runs], options.together)
