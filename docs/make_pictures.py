@@ -3,13 +3,15 @@
     python docs/make_pictures.py runs/spot runs/cow
     python docs/make_pictures.py --together phones runs/spot_charuco runs/hard_table
     python docs/make_pictures.py --steps examples/spot runs/spot
+    python docs/make_pictures.py --report runs/spot
 
 Of one view: a photo, the mesh from two sides, depth and normals. Of several views and lies: a photo of each, and the
 mesh from all sides. Together: a row for each run, which ends with the view relit from a place where no lamp was.
-Steps: what the method page shows of one run, from photo and shadows to the relit view.
+Steps: what the method page shows of one run, from photo and shadows to the relit view. Report: two parts of its report.
 """
 
 import argparse
+import shutil
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,6 +33,7 @@ from reconstruct.source.source import open_source
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.display.pictures import depth_picture, mesh_picture, normal_picture
 
+PICTURES = Path(__file__).parent / "pictures"
 HEIGHT = 300  # px of every panel
 SMALL, WIDE = 240, 1.45  # of several views': height, and width over height of photos
 SIDES_DEG = (
@@ -167,9 +170,22 @@ def save(rows: list[list[Image.Image]], name: str) -> None:
     for strip in strips:
         sheet.paste(strip, (0, top))
         top += strip.height
-    target = Path(__file__).parent / "pictures" / f"{name}.jpg"
-    target.parent.mkdir(exist_ok=True)
-    sheet.save(target, quality=88)
+    sheet.save(PICTURES / f"{name}.jpg", quality=88)
+
+
+def report_parts(run: Path) -> None:
+    """Write report.jpg, its verdict, and lights.jpg, the drawings of the lights. Needs Playwright and a Chromium."""
+    from playwright.sync_api import sync_playwright
+
+    path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        tab = browser.new_page(viewport={"width": 1000, "height": 900})
+        tab.goto((run / "report.html").resolve().as_uri())
+        for name, heading in (("report", "h1"), ("lights", "h2:text-is('Lights')")):
+            part = tab.locator("section, header", has=tab.locator(heading)).last
+            part.screenshot(path=PICTURES / f"{name}.jpg", quality=85)
+        browser.close()
 
 
 def main() -> None:
@@ -178,7 +194,11 @@ def main() -> None:
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--together", metavar="NAME", help="one picture of this name, a row for each run of one view")
     parser.add_argument("--steps", metavar="CAPTURE", type=Path, help="steps.jpg of this capture's run")
+    parser.add_argument("--report", action="store_true", help="report.jpg and lights.jpg of a run")
     options = parser.parse_args()
+    if options.report:
+        report_parts(options.runs[0])
+        return
     if options.steps:
         parts = steps(options.runs[0], options.steps)
         save([parts[:3], parts[3:]], "steps")
