@@ -121,15 +121,12 @@ def page(folder: Path) -> str:
     lines = [HEAD.format(count=len(SECTIONS))]
     for section in SECTIONS:
         kept = json.loads((folder / f"{section.name}.json").read_text(encoding="utf-8"))
-        lines += [
-            "",
-            f"## {section.title}",
-            "",
-            " ".join(section.text.split()),
-            *([kept["note"]] if kept["note"] else []),
-            "",
-        ]
-        lines += [*table(kept["rows"]), "", f"Made by `{kept['command']}`: {kept['made']}."]
+        columns = section.columns.split("; ") if section.columns else list(kept["rows"][0])
+        rows = [{key: row.get(key) for key in columns} for row in kept["rows"]]
+        rows = [row for row in rows if any(row[key] is not None for key in columns[2:])]  # the rest was not scored
+        text = " ".join(f"{section.text} {kept['note']}".split())
+        made = f"Made by `{kept['command']}`: {kept['made']}."
+        lines += ["", f"## {section.title}", "", text, "", *table(rows), "", made]
     return "\n".join(lines) + "\n"
 
 
