@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import psutil
@@ -50,7 +49,6 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--nodes", type=int, nargs="*", default=[], help="grids to time; else those of the preset")
     parser.add_argument("--no-cpu-solve", action="store_true", help="leave out the whole solve by the kernels")
     parser.add_argument("--no-solve", action="store_true", help="leave out all whole solves")
-    parser.set_defaults(table=Path("gpu.md"))
     return parser.parse_args()
 
 
