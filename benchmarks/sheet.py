@@ -23,7 +23,6 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 NUMBER = re.compile(r"-?\d[\d.e+-]*$")
-KIB_PER_GIB = 2**20  # the kernel counts a process's peak in KiB
 
 
 def machine() -> str:

@@ -18,8 +18,7 @@ import cv2
 import numpy as np
 import torch
 import trimesh
-from one_run import SPOT
-from sheet import ROOT, parser_of
+from sheet import parser_of
 from synthetic import HEAP, Look, render  # pyright: ignore[reportMissingImports]  # of the tests
 
 from calibration.calibration import Calibration, save_calibration
@@ -40,7 +39,6 @@ from reconstruct.source.source import open_source
 
 SAMPLES = 20_000  # points on each surface: the F-score repeats to 0.003
 SYNTHETIC = "synthetic"
-SHIPPED = [str(SPOT.relative_to(ROOT)), SYNTHETIC]  # what needs no data
 LOOK = Look(width=200, height=150, n_lights=40, noise=0.003, texture=0.2, with_shadow=True, with_mask=True)
 MEASURES = {  # by the names of a capture's measure, of a scene's
     "depth": ("depth_mae_mm", "depth_l1_raw"),
@@ -107,8 +105,6 @@ def open_subject(named: str, kind: str = "auto", preset: str = "standard") -> Su
         return synthetic(kind)
     place, _, board = named.partition("@")
     folder, options = Path(place), RunOptions(board=board or None, preset=preset, input=kind)
-    if not folder.exists() and named in SHIPPED:
-        folder = ROOT / place
     source = open_source(folder, options)
     pictures = read_photos(source, options)
     calibration = calibrate_source(source, pictures, options).first
@@ -166,17 +162,13 @@ def as_truth(solved: Fields, calibration: Calibration) -> Reference:
     return of_maps(calibration, depth, normals, mask, solved.ground_height)
 
 
-def score(solved: Fields, subject: Subject, calibration: Calibration | None = None) -> dict:
-    """Every measure of a solved scene by its name.
-
-    Args:
-        calibration: the lights to score; the subject's unless given.
-    """
+def score(solved: Fields, subject: Subject) -> dict:
+    """Every measure of a solved scene by its name."""
     if subject.truth is not None:
         return compare_views(subject.truth, seen(solved, subject.truth), None)
     assert subject.folder is not None
     with tempfile.TemporaryDirectory() as folder:
-        leave(solved, calibration or subject.calibration, Path(folder))
+        leave(solved, subject.calibration, Path(folder))
         return evaluate(Path(folder), subject.folder, SAMPLES)
 
 
