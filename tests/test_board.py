@@ -183,8 +183,8 @@ def test_a_board_too_small_in_its_photo_is_not_found(size):
 
 def test_a_board_of_many_markers_ends_the_search_for_dictionaries(monkeypatch):
     asked = []
-    read = recognise._markers
-    monkeypatch.setattr(recognise, "_markers", lambda photo, name: (asked.append(name), read(photo, name))[1])
+    read = recognise.read_markers
+    monkeypatch.setattr(recognise, "read_markers", lambda photo, name: (asked.append(name), read(photo, name))[1])
     assert guess_board([board_photo(CHARUCO, CAMERA, POSE)])
     assert set(asked) == {"DICT_4X4_50", "DICT_4X4_1000"}
 

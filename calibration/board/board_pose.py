@@ -1,6 +1,6 @@
 """Estimate the camera's pose above the board with its uncertainty; ambiguous poses are refused."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -35,6 +35,10 @@ class BoardView:
     def rms(self) -> float:
         """Root of the mean squared distance between seen and projected corners, px."""
         return float(np.sqrt((self.residuals**2).sum(1).mean()))
+
+    def misfit(self) -> float:
+        """Median distance between seen and projected corners along one axis, px."""
+        return float(np.median(np.abs(self.residuals)))
 
     def normal(self) -> Float[np.ndarray, "3"]:
         """The ground's upward normal in the camera frame."""
@@ -90,15 +94,11 @@ def fit_ground(
         )
     views = board_views(corners, camera, robust_at)
     if not views:
+        raise CalibrationError(f"board pose: {unexplained(corners, camera, robust_at)}.")
+    best, limit = views[0], WORST_MISFIT * max(camera.width, camera.height)
+    if best.misfit() > limit:
         raise CalibrationError(
-            "board pose: no camera above the ground explains the corners: the photo is mirrored, or shows another "
-            "board. Use the photo as the camera took it, and check the board's columns and rows."
-        )
-    best = views[0]
-    misfit, limit = float(np.median(np.abs(best.residuals))), WORST_MISFIT * max(camera.width, camera.height)
-    if misfit > limit:
-        raise CalibrationError(
-            f"board pose: corners are {misfit:.1f} px off, at most {limit:.1f} px expected. "
+            f"board pose: corners are {best.misfit():.1f} px off, at most {limit:.1f} px expected. "
             "Check the board's columns and rows, and that it lies flat."
         )
     _refuse_ambiguous(views, robust_at / 3)
@@ -111,6 +111,20 @@ def fit_ground(
         )
     in_world = _in_world(best.camera_from_world, covariance)
     return GroundFit(best.camera_from_world.inverse(), best.rms(), normal_sigma, height_sigma, in_world)
+
+
+def unexplained(corners: Corners, camera: Camera, robust_at: float = ROBUST_AT) -> str:
+    """Return why board_views finds no pose; it says that the photo is mirrored only where a mirrored board fits."""
+    views = board_views(replace(corners, points=corners.points * [-1.0, 1.0, 1.0]), camera, robust_at)
+    if views and views[0].misfit() <= WORST_MISFIT * max(camera.width, camera.height):
+        return (
+            f"the board is seen mirrored ({views[0].misfit():.1f} px off; as printed, it fits no camera above the "
+            "ground). Use the photo as the camera took it"
+        )
+    return (
+        f"no camera above the ground explains the {len(corners.pixels)} corners seen, not even if the photo was "
+        "mirrored. Keep the whole board in view, and check its columns and rows"
+    )
 
 
 _ADVICE = "Photograph the board larger and from a slant of 30 to 60 degrees, with all its corners in view."

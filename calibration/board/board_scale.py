@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.board.blank import Blank
-from calibration.board.board import AnyBoard, Board, opencv_dictionary
-from calibration.board.corners import Corners, Grey
+from calibration.board.board import AnyBoard, Board
+from calibration.board.corners import Corners, Grey, read_markers
 from calibration.board.printing import DEFAULT_BOARDS
 from capture.decode.exif import Optics
 
@@ -83,13 +83,11 @@ def marker_share(grey: Grey, corners: Corners) -> float | None:
     board = corners.board
     if not isinstance(board, Board) or board.kind != "charuco":
         return None
-    detection = cv2.aruco.DetectorParameters()
-    detection.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX  # else they lie half a pixel inside the black
-    found, ids, _ = cv2.aruco.ArucoDetector(opencv_dictionary(board.dictionary), detection).detectMarkers(grey)
+    ids, quads = read_markers(grey, board.dictionary)
     flat, _ = cv2.findHomography(corners.pixels, corners.points[:, :2])
-    if ids is None or flat is None:
+    if not len(ids) or flat is None:
         return None
-    quads = cv2.perspectiveTransform(np.asarray(found, np.float64).reshape(-1, 1, 2), flat).reshape(-1, 4, 2)
+    quads = cv2.perspectiveTransform(quads.reshape(-1, 1, 2), flat).reshape(-1, 4, 2)
     sides: Float[np.ndarray, "markers 4"] = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2)
     return float(np.median(sides) / board.square_mm)
 

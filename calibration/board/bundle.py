@@ -10,7 +10,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from calibration.board.board_pose import CORNER_SIGMA, plane_poses
 from calibration.board.corners import Corners
-from calibration.board.sheet import FLAT, FLATTEST, Sheet, Waves, corner_indices, sheet_of, weigh_waves
+from calibration.board.sheet import FLAT, FLATTEST, Sheet, Waves, nearest_corners, sheet_of, weigh_waves
 from calibration.camera import project_from
 
 FINEST_NOISE = 0.04  # px: the corners of good photos are this good; few residuals may look better by chance
@@ -101,7 +101,7 @@ class Solution:
         """Return the corners of a photo with the sheet's heights in their points."""
         if self.sheet is None or not self.waves.size or not self.sheet.has(photo):
             return photo
-        heights = self.heights()[corner_indices(photo)]
+        heights = nearest_corners(photo) @ self.heights()
         return replace(photo, points=photo.points + np.outer(heights, [0.0, 0.0, 1.0]))
 
     def without(self, used: Bool[np.ndarray, " photos"]) -> "Solution":

@@ -6,21 +6,23 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from calibration.board.blank import Blank
-from calibration.board.board import AnyBoard, Board
+from calibration.board.board import AnyBoard, Board, opencv_dictionary
 from calibration.board.lattice import find_lattices, flat_view
-from calibration.board.placement import place
+from calibration.board.placement import place, placed_markers
 from calibration.board.sheet_edges import find_edges
 from capture.photos.photo import Photo, encode_srgb, read_photo
 
 Grey = UInt8[np.ndarray, "_ _"]  # height, width; a reduced copy may stand beside the photo in one signature
+Markers = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 4 2"]]
 
 BRIGHT_SHARE = 99.5  # per cent of the values that may not exceed white when a dark photo is lifted
 FEWEST_CORNERS = 6  # four fix the plane's eight numbers exactly; below two more, a wrong corner goes unnoticed
 SEARCH_SIZES = (1000, 500, 2000)  # px, longer side: most boards; blurred ones; small ones in a large photo
-ENOUGH_OF_BOARD = 0.6  # of its corners: no further size is tried
+MARKER_SIZE = 1500  # px, longer side: markers are read there, and in the whole photo
+ENOUGH_OF_BOARD = 0.6  # of its corners: no further size is tried, and no marker read
 MOSTLY_GOOD = 0.75  # of a lattice's corners fit the others; a lattice over clutter has half
 SADDLE_SMALLEST = 3.0  # px, half window of the saddle fit
 SADDLE_WIDEST = 0.2  # of the spacing, half window: well clear of the neighbours
@@ -39,7 +41,10 @@ ALIKE_PX = 1.0  # from their median, at any size: corners are found within a ten
 
 @dataclass(frozen=True)
 class Corners:
-    """Where corners of a board were seen: pixels[i] is the photo's view of points[i]."""
+    """Where points of a board were seen: pixels[i] is the photo's view of points[i].
+
+    Corners of its squares, and middles of markers, which are seen as precisely: nothing that follows tells them apart.
+    """
 
     pixels: Float[np.ndarray, "n 2"]
     points: Float[np.ndarray, "n 3"]  # world, mm: on the printed side, z = 0
@@ -75,13 +80,21 @@ def find_board(grey: Grey, board: AnyBoard, allow_part: bool = False) -> Corners
     Both orders of columns and rows and both generations of the ChArUco pattern are tried. A part of the board is
     enough, but a checkerboard with a whole row or column hidden cannot be numbered and needs allow_part. The numbering
     does not mirror the board. Where the print distinguishes its two ends, the first corner is the same in every photo.
-    Corners that do not fit the others are left out.
+    Corners that do not fit the others are left out. Where few corners of a ChArUco board are seen, the middles of its
+    markers are points of the board too: something may cover all but a frame of it.
     """
     if isinstance(board, Blank):
         edges = find_edges(grey, board)
         return None if edges is None else Corners(edges.pixels, edges.points, board, True, edges.across)
-    best: Corners | None = None
     enough = len(board.points()) * ENOUGH_OF_BOARD
+    best = _by_lattice(grey, board, allow_part, enough)
+    is_enough = best is not None and best.is_placed and len(best.pixels) >= enough
+    return best if is_enough or board.kind != "charuco" else _with_markers(best, grey, board)
+
+
+def _by_lattice(grey: Grey, board: Board, allow_part: bool, enough: float) -> Corners | None:
+    """Find corners of squares; no further size of the photo is searched once this many are found."""
+    best: Corners | None = None
     for image, scale in _levels(grey):
         for found in _placed(image, scale, board, allow_part):
             if best is None or (found.is_placed, len(found.pixels)) > (best.is_placed, len(best.pixels)):
@@ -127,6 +140,38 @@ def _placed(
         good = _fits_the_rest(pixels, points[:, :2], board.square_mm)
         if good.sum() >= max(FEWEST_CORNERS, MOSTLY_GOOD * len(good)) and not _is_line(points[good]):
             yield Corners(pixels[good], points[good], placement.board, placement.is_placed)
+
+
+def _with_markers(found: Corners | None, grey: Grey, board: Board) -> Corners | None:
+    """Return the corners with the middles of the markers that are read; as they were, if these are too few."""
+    placed = placed_markers(*read_markers(grey, board.dictionary), board)
+    if placed is None:
+        return found
+    variant, pixels, points = placed
+    if found is not None and found.is_placed and found.board == variant:
+        pixels, points = np.concatenate([found.pixels, pixels]), np.concatenate([found.points, points])
+    good = _fits_the_rest(pixels, points[:, :2], board.square_mm)
+    if good.sum() < MOSTLY_GOOD * len(good) or (found is not None and good.sum() <= len(found.pixels)):
+        return found
+    return Corners(pixels[good], points[good], variant)
+
+
+def read_markers(grey: Grey, dictionary: str) -> Markers:
+    """Return the number and the four corners (px) of every marker of this dictionary that OpenCV reads."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR  # .1 px; two to six times that without
+    detector = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary), parameters)
+    whole = max(grey.shape)
+    read: dict[int, Float[np.ndarray, "4 2"]] = {}
+    for size in sorted({min(MARKER_SIZE, whole), whole}):
+        image, scale = reduced(grey, size)
+        quads, ids, _ = detector.detectMarkers(image)
+        for number, quad in zip([] if ids is None else np.ravel(ids).tolist(), quads, strict=True):
+            corners = np.asarray(quad, float).reshape(4, 2)
+            outward = corners - corners.mean(0)  # OpenCV's outline runs through the outermost black pixels,
+            corners += np.sqrt(0.5) * outward / np.linalg.norm(outward, axis=1, keepdims=True)  # half a pixel inside
+            read[number] = (corners + 0.5) / scale - 0.5
+    return np.array(list(read), int), np.array(list(read.values())).reshape(-1, 4, 2)
 
 
 def _clear_share(board: Board) -> float:
@@ -230,16 +275,20 @@ def _flat_view(
 
 
 def _smooth(values: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], degree: int) -> Float[np.ndarray, "n 2"]:
-    """Fit a polynomial in board coordinates to values with a few outliers (weights of Cauchy's loss)."""
+    """Fit a polynomial in board coordinates to offsets (squares) with a few outliers (weights of Cauchy's loss).
+
+    A wide lens bends a board by a square: what the other corners leave open, a stray one does not decide.
+    """
     x, y = ((plane - plane.mean(0)) / plane.std(0).max()).T
     terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], 1)
-    weights = np.ones(len(values))
+    stiff, rest = np.eye(terms.shape[1]) * STRAY[degree], np.zeros((terms.shape[1], 2))
     fitted = np.zeros_like(values)
     for _ in range(10):
-        root = np.sqrt(weights)[:, None]
-        fitted = terms @ np.linalg.lstsq(terms * root, values * root, rcond=None)[0]
-        distance = np.linalg.norm(values - fitted, axis=1)
-        weights = 1 / (1 + (distance / max(2 * np.median(distance), 1e-6)) ** 2)
+        distance = np.linalg.norm(values - fitted, axis=1)  # at first from the flat view, which no stray corner bends
+        root = 1 / np.sqrt(1 + (distance / max(2 * np.median(distance), 1e-6)) ** 2)[:, None]
+        fitted = (
+            terms @ np.linalg.lstsq(np.vstack([terms * root, stiff]), np.vstack([values * root, rest]), rcond=None)[0]
+        )
     return fitted
 
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
@@ -16,6 +17,8 @@ PLACED_BOARD = 0.5  # of the corners: fewer that span the whole of it are clutte
 UNLIKELY = 6.0  # sigmas of chance agreement between what is printed and what is seen
 CLEARLY_BETTER = 2.5  # sigmas above the second best place
 LEAST_AGREEMENT = 0.2  # mean correlation of the bits: blurred markers have 0.4, others 0
+FEWEST_MARKERS = 6  # four determine the view, two more reveal another board
+ON_GRID = 0.15  # squares: how far lens distortion moves a marker from the flat grid
 FLAT_SQUARE = 4.0  # grey levels, standard deviation: less is no marker, but something plain on the board
 TURNS = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]])  # by quarters
 
@@ -155,6 +158,47 @@ def _by_markers(lattice: Lattice, image: Float32[np.ndarray, "height width"], bo
     corners = lattice.cells @ TURNS[turn].T + shift - 1  # inner corners begin one square inside
     inside = ((corners >= 0) & (corners < variant.corner_counts())).all(1)
     return Placement(variant, np.nonzero(inside)[0], corners[inside], not rivals)
+
+
+def placed_markers(
+    ids: Int[np.ndarray, " n"], quads: Float[np.ndarray, "n 4 2"], board: Board
+) -> tuple[Board, Float[np.ndarray, "used 2"], Float[np.ndarray, "used 3"]] | None:
+    """Return the middles of the markers (px) that lie as on this board, and where they are on it (world, mm).
+
+    The board's columns and rows come as they are. None where fewer than FEWEST_MARKERS lie so.
+    """
+    best: tuple[int, float, Board, np.ndarray, np.ndarray] | None = None
+    share = board.marker_mm / board.square_mm * (np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) - 0.5)
+    for printed in _prints(board):
+        known = np.flatnonzero(ids < len(printed.cells))
+        cells = printed.cells[ids[known]].astype(float)
+        flat = on_cells(quads[known], cells)
+        if flat is None:
+            continue
+        off = np.linalg.norm(flat - cells[:, None] - share, axis=2).max(1)  # of its worst corner: it may be turned
+        good = off < ON_GRID
+        if good.sum() >= FEWEST_MARKERS and (best is None or (good.sum(), -off[good].mean()) > best[:2]):
+            best = int(good.sum()), -float(off[good].mean()), printed.board, middles(quads[known[good]]), cells[good]
+    if best is None:
+        return None
+    _, _, variant, pixels, cells = best
+    return variant, pixels, np.column_stack([cells + 0.5, np.zeros(len(cells))]) * variant.square_mm * [1, -1, 1]
+
+
+def on_cells(quads: Float[np.ndarray, "n 4 2"], cells: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 4 2"] | None:
+    """Return markers (px) on the board, in columns and rows, by a flat view that puts most middles into these cells."""
+    if len(cells) < FEWEST_MARKERS or np.linalg.matrix_rank(cells - cells.mean(0)) < 2:
+        return None
+    matrix, _ = cv2.findHomography(middles(quads), cells, cv2.USAC_MAGSAC, ON_GRID)
+    return None if matrix is None else cv2.perspectiveTransform(quads.reshape(-1, 1, 2), matrix).reshape(-1, 4, 2)
+
+
+def middles(quads: Float[np.ndarray, "n 4 2"]) -> Float[np.ndarray, "n 2"]:
+    """Return where the diagonals cross: the middle in any perspective, however blur and tone move the four edges."""
+    homogeneous = np.concatenate([quads, np.ones((len(quads), 4, 1))], 2)
+    one, other = (np.cross(homogeneous[:, k], homogeneous[:, k + 2]) for k in (0, 1))
+    crossing = np.cross(one, other)
+    return crossing[:, :2] / crossing[:, 2:]
 
 
 def _best_shifts(

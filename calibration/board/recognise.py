@@ -5,14 +5,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
 from calibration.board.board import Board, opencv_dictionary, parse_board
-from calibration.board.corners import SEARCH_SIZES, Grey, find_board, grey_of, reduced
+from calibration.board.corners import MARKER_SIZE, SEARCH_SIZES, Grey, find_board, grey_of, read_markers, reduced
 from calibration.board.lattice import find_lattices
-from calibration.board.placement import trimmed
+from calibration.board.placement import FEWEST_MARKERS, ON_GRID, on_cells, trimmed
 from capture.photos.photo import read_small_photo
 
 ASSUMED_SQUARE_MM = 30.0  # what fits five or six times across A4
@@ -24,19 +23,14 @@ FAMILIES = (  # by increasing size: the small ones are the beginnings of the lar
     ("DICT_ARUCO_ORIGINAL",),
     ("DICT_APRILTAG_36h11",),
 )
-MARKER_SIZE = 1500  # px, longer side: markers are read there
 MOST_COLUMNS = 20  # squares
-FEWEST_MARKERS = 6  # four determine the view, two more reveal a wrong number of columns
 MOST_HIDDEN_ROWS = 2  # after the last marker that was read; their corners show them
 ROW_SEEN = 0.5  # of a row's corners make a row
-ON_GRID = 0.15  # squares: how far lens distortion moves a marker from the flat grid
 AGREEING = 0.7  # of the markers; the rest may be false detections
 SURE_MARKERS = 10  # that lie on one board: no other dictionary reads so many by chance, so none is asked
 FEWEST_CORNERS = 20  # inner corners, as of 5 x 4: smaller grids are found in tablecloths
 MANY_CORNERS = 200  # ends the search: more than most prints have
 ENOUGH_PHOTOS = 5  # looked at per question
-
-Markers = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 4 2"]]
 
 
 @dataclass(frozen=True)
@@ -88,9 +82,9 @@ def _guess_charuco(photos: Sequence[Grey]) -> Board | None:
     small = [reduced(photo, MARKER_SIZE)[0] for photo in photos]
     best: tuple[int, Board] | None = None
     for family in FAMILIES:
-        seen = [_markers(photo, family[0]) for photo in small]
+        seen = [read_markers(photo, family[0]) for photo in small]
         if len(family) > 1 and max((len(ids) for ids, _ in seen), default=0) >= FEWEST_MARKERS:
-            seen = [_markers(photo, family[-1]) for photo in small]  # larger boards go on in the larger dictionaries
+            seen = [read_markers(photo, family[-1]) for photo in small]  # larger boards go on in larger ones
         layouts = [found for found in (_layout(*markers) for markers in seen) if found is not None]
         for columns, ratio, _, _ in sorted(layouts, key=lambda one: -one.n_markers)[:2]:
             top = max(one.top for one in layouts if one.columns == columns)
@@ -100,13 +94,6 @@ def _guess_charuco(photos: Sequence[Grey]) -> Board | None:
         if best and max((one.n_markers for one in layouts), default=0) >= SURE_MARKERS:
             break
     return best[1] if best else None
-
-
-def _markers(photo: Grey, dictionary: str) -> Markers:
-    corners, ids, _ = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary)).detectMarkers(photo)
-    if ids is None or len(ids) == 0:
-        return np.zeros(0, int), np.zeros((0, 4, 2))
-    return np.ravel(ids).astype(int), np.asarray(corners, np.float64).reshape(-1, 4, 2)
 
 
 class _Layout(NamedTuple):
@@ -122,22 +109,18 @@ def _layout(ids: Int[np.ndarray, " n"], corners: Float[np.ndarray, "n 4 2"]) -> 
     """Return how consecutive markers lie on a board; None for no regular board."""
     if len(ids) < FEWEST_MARKERS:
         return None
-    centres = corners.mean(1)
     best: tuple[int, float, _Layout] | None = None
     for columns in range(3, MOST_COLUMNS + 1):
         for is_legacy in (False, True):
             cells = _cells(columns, int(ids.max()) + 1, is_legacy)[ids]
-            if np.linalg.matrix_rank(cells - cells.mean(0)) < 2:
+            flat = on_cells(corners, cells)
+            if flat is None:
                 continue
-            matrix, _ = cv2.findHomography(centres, cells, cv2.RANSAC, ON_GRID)
-            if matrix is None:
-                continue
-            off = np.linalg.norm(cv2.perspectiveTransform(centres[:, None], matrix)[:, 0] - cells, axis=1)
+            off = np.linalg.norm(flat.mean(1) - cells, axis=1)
             good = off < ON_GRID
             if good.sum() < max(FEWEST_MARKERS, AGREEING * len(ids)):
                 continue
-            flat = cv2.perspectiveTransform(corners[good].reshape(-1, 1, 2), matrix).reshape(-1, 4, 2)
-            ratio = float(np.median(np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=2)))
+            ratio = float(np.median(np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=2)[good]))
             layout = _Layout(columns, ratio, int(good.sum()), int(ids[good].max()))
             score = (layout.n_markers, -float(off[good].mean()), layout)
             if 0 < ratio < 1 and (best is None or score > best):
@@ -178,7 +161,7 @@ def _with_hidden_rows(board: Board, photos: Sequence[Grey]) -> tuple[Board, int]
 
 def _n_corners(board: Board, photos: Sequence[Grey], from_row: int = 0) -> int:
     """Count the seen corners from this row on, over all photos."""
-    highest = -(from_row + 0.5) * board.square_mm  # rows run towards negative y
+    highest = -(from_row + 0.75) * board.square_mm  # rows run towards negative y; markers lie half way between two
     found = [corners for photo in photos if (corners := find_board(photo, board)) is not None]
     return sum(int((corners.points[:, 1] < highest).sum()) for corners in found if corners.board == board)
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from calibration.board.board import Board
 from calibration.board.corners import Corners
@@ -36,7 +36,7 @@ class Sheet:
         """Return the height of each corner of a photo by c; 0 where corners cannot be numbered."""
         if not self.has(photo):
             return np.zeros((len(photo.points), self.basis.shape[1]))
-        return self.basis[corner_indices(photo)]
+        return nearest_corners(photo) @ self.basis
 
 
 @dataclass(frozen=True)
@@ -75,10 +75,11 @@ def sheet_of(photos: Sequence[Corners]) -> Sheet | None:
     return Sheet(board, rest, tuple(shapes), tuple(planes))
 
 
-def corner_indices(photo: Corners) -> Int[np.ndarray, " n"]:
-    """Return the number of each of a photo's corners among those of its board."""
+def nearest_corners(photo: Corners) -> Float[np.ndarray, "n corners"]:
+    """Return the weight of each corner of the board for each of a photo's points: itself, or those all round."""
     apart = np.linalg.norm(photo.points[:, None, :2] - photo.board.points()[:, :2], axis=-1)
-    return np.argmin(apart, axis=1)
+    near = np.isclose(apart, apart.min(1, keepdims=True))
+    return near / near.sum(1, keepdims=True)
 
 
 def weigh_waves(

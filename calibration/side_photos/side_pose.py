@@ -17,6 +17,7 @@ from calibration.board.board_pose import (
     WORST_MISFIT,
     board_views,
     fit_pose_and_focus,
+    unexplained,
 )
 from calibration.board.corners import FEWEST_CORNERS, Corners
 from calibration.camera import Camera, project_from
@@ -50,7 +51,7 @@ def side_pose(corners: Corners, camera: Camera, about: Float[np.ndarray, "n 3"])
         )
     views = board_views(corners, camera)
     if not views:
-        return "no camera above the ground explains the board's corners: the photo is mirrored, or shows another board"
+        return unexplained(corners, camera)
     fits = [fit_pose_and_focus(view.camera_from_world, corners, camera) for view in views]
     fits.sort(key=lambda fit: fit.cost)
     best = fits[0]
