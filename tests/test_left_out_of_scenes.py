@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from dataset_folders import (
     from_above,
+    places,
     towards_lights,
     write_diligent,
+    write_grey,
     write_photo,
     write_rti,
     write_s3nerf,
@@ -15,6 +17,7 @@ from dataset_folders import (
 )
 from PIL import Image
 from synthetic import BALL, Look, render
+from test_known import write_scene
 
 import shadowgraph
 from calibration.lights.files import read_lights
@@ -68,7 +71,8 @@ FAULTS = {"truncated": (truncated, "unreadable"), "empty": (empty, "unreadable")
 
 
 def photos_of(place):
-    return sorted(path for path in place.iterdir() if path.suffix == ".png" and path.stem not in ("mask", "Normal_gt"))
+    others = ("mask", "Normal_gt")
+    return sorted(p for p in place.glob("*.png") if p.stem not in others and not p.stem.endswith("_white_"))
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -123,8 +127,24 @@ def shadowneus_real(folder, truth):
     return folder / "image"
 
 
+def shadowneus(folder, _):
+    write_scene(folder, Look(width=SIDE, height=SIDE, n_lights=PHOTOS))
+    return folder / "train"
+
+
+def deepshadow(folder, truth):
+    lines = []
+    for i, (x, y, z) in enumerate(places(truth)):
+        write_grey(folder / "0" / f"cup_0_{i}_shadow1.png", truth.visibility[i])
+        lines.append(f"cup_0_{i} {x} {y} {z}")
+    given = {"focal_length": 44.0} | {f"cam_location_{axis}": 0.0 if axis != "z" else 40.0 for axis in "xyz"}
+    (folder / "params.json").write_text(json.dumps(given))
+    (folder / "all_object_lights.txt").write_text("\n".join(lines))
+    return folder / "0"
+
+
 @pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("layout", [ours, s3nerf, shadowneus_real])
+@pytest.mark.parametrize("layout", [ours, s3nerf, shadowneus_real, shadowneus])
 def test_lights_with_a_camera_stay_with_their_photos(tmp_path, truth, layout, fault):
     if layout is not ours:
         truth = render((BALL,), Look(width=SIDE, height=SIDE, n_lights=PHOTOS), from_above(SIDE))[1]
@@ -143,6 +163,28 @@ def test_lights_with_a_camera_stay_with_their_photos(tmp_path, truth, layout, fa
     assert apart[0] == pytest.approx(apart[1], rel=0.05, abs=1e-3)
     stack = read_photos(source, RunOptions())[0].stack
     assert stack is not None and list(stack.paths) == paths[1:]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize(
+    ("layout", "pictures"),
+    [(s3nerf, "visibility/*.png"), (shadowneus, "train/*_white_.png"), (deepshadow, "0/*_shadow1.png")],
+)
+def test_a_bad_picture_of_shadows_is_left_out_with_its_photo_and_light(tmp_path, layout, pictures, fault):
+    point_lights = Look(width=SIDE, height=SIDE, n_lights=PHOTOS)
+    layout(tmp_path / "scene", render((BALL,), point_lights, from_above(SIDE))[1])
+    shadows = sorted((tmp_path / "scene").glob(pictures))
+    bad = shadows.pop(2)
+    FAULTS[fault][0](bad)
+    options = RunOptions(input="shadow")
+    source = open_source(tmp_path / "scene", options)
+    known = source.known
+    assert [(one.photo, one.kind) for one in source.left_out()] == [(bad, FAULTS[fault][1])]
+    assert known is not None and list(known.shadow_paths or ()) == shadows
+    named = known.rgb_paths or known.shadow_paths or ()
+    assert [light.photo for light in known.calibration.lights] == [path.name for path in named]
+    read = read_photos(source, options)[0].shadow
+    assert read is not None and len(read) == PHOTOS - 1
 
 
 @pytest.mark.parametrize("layout", [rti, diligent])

@@ -15,6 +15,7 @@ from capture.errors import CalibrationError
 from capture.files.json_field import JsonField, read_object, read_text
 from capture.files.names import inside
 from capture.photos.photo import read_grey
+from capture.session.scene_photos import scene_photos
 
 LIGHTS, PARAMETERS, PICTURES = "all_object_lights.txt", "params.json", "0"
 BACKGROUND = 0.5  # of the silhouette's white: darker pixels are bare ground
@@ -59,7 +60,9 @@ def load_deepshadow(folder: Path) -> KnownScene:
         CalibrationError: a file or field is missing or impossible; the message names both.
     """
     rows = _rows(folder / LIGHTS)
-    shadow = tuple(inside(folder, f"{PICTURES}/{row.name}_shadow1.png", str(folder / LIGHTS)) for row in rows)
+    pictures = [inside(folder, f"{PICTURES}/{row.name}_shadow1.png", str(folder / LIGHTS)) for row in rows]
+    usable = scene_photos(pictures)
+    shadow, rows = tuple(usable.paths), [rows[row] for row in usable.rows]
     height, width = read_grey(shadow[0]).shape
     given = JsonField(read_object(folder / PARAMETERS, "focal_length"), str(folder / PARAMETERS))
     focal = given["focal_length"].number(above=0.0)
@@ -74,6 +77,8 @@ def load_deepshadow(folder: Path) -> KnownScene:
         rgb_paths=None,
         shadow_paths=shadow,
         mask_path=_silhouette(folder, rows[0].name),
+        photos_left_out=usable.left_out,
+        every_photo=usable.every,
         mask_is_grey=True,
         ground_known=False,
     )

@@ -55,7 +55,7 @@ class OwnScene:
         )
         if rgb is None and shadows is None:
             raise CalibrationError(f"{source}: neither '{PHOTOS}' nor '{SHADOWS}' is true; one of them was needed.")
-        usable = scene_photos(rgb or shadows or ())
+        usable = scene_photos(*(paths for paths in (rgb, shadows) if paths))
         kept = {names[row] for row in usable.rows}
         mask = folder / MASK
         return KnownScene(

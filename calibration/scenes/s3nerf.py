@@ -66,7 +66,9 @@ class S3Nerf:
         is_captured = "light_pos" not in document.value
         given = _captured(document, folder) if is_captured else _rendered(document)
         found_photos, rows = _numbered(folder / PHOTOS, len(given.places), source)
-        usable = scene_photos(found_photos)
+        shadows = [folder / SHADOWS / path.name for path in found_photos]
+        has_shadows = all(path.is_file() for path in shadows)
+        usable = scene_photos(found_photos, *([shadows] if has_shadows else []))
         photos, rows = usable.paths, [rows[row] for row in usable.rows]
         size, camera = read_size(photos[0]), given.posed_camera.camera
         if size != (camera.width, camera.height):
@@ -76,12 +78,11 @@ class S3Nerf:
             )
         given = replace(given, places=given.places[rows])
         calibration, found = _grounded(given, photos, is_captured)
-        shadows = [folder / SHADOWS / path.name for path in photos]
         mask = folder / MASK
         return KnownScene(
             with_common_power(calibration, preview(photos, is_linear=True)),
             tuple(photos),
-            tuple(shadows) if all(path.is_file() for path in shadows) else None,
+            tuple(folder / SHADOWS / path.name for path in photos) if has_shadows else None,
             mask if mask.is_file() else None,
             mask_is_grey=True,
             ground_known=found is not None,

@@ -19,6 +19,7 @@ from capture.errors import CalibrationError
 from capture.files.json_field import read_object
 from capture.files.names import inside
 from capture.photos.photo import read_photo, read_stack
+from capture.session.scene_photos import scene_photos
 
 OPENCV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])  # Blender: x right, y up, looking along -z
 PREVIEW_LONG_SIDE = 128  # px: enough for one number per scene (kind of light, power)
@@ -66,6 +67,9 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
     if len({p.name for p in pictures}) < len(pictures):
         raise CalibrationError(f"{source}: two frames share the file name of their 'file_path'; give each its own.")
     shadow_paths = _shadow_paths(pictures)
+    usable = scene_photos(pictures, *([shadow_paths] if shadow_paths else []))
+    every, pictures, kept = pictures, usable.paths, {path.name for path in usable.paths}
+    shadow_paths = shadow_paths and [shadow_paths[row] for row in usable.rows]
     is_shadow_only = _is_shadow_picture(pictures[0]) and _is_shadow_picture(pictures[-1])
     shadow_paths = shadow_paths or (pictures if is_shadow_only else None)
     if any(len(_suns(frame, f"{source}, frame {i}")) > 1 for i, frame in enumerate(frames)):
@@ -78,7 +82,10 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
     height = _ground_height(folder / "transforms_floor.json")
     if world_from_camera.translation[2] <= height:
         raise CalibrationError(f"{source}: the camera is below the ground (z = {height:g}); one above it was needed.")
-    candidates = {kind: _lights(frames, pictures, kind, height, source) for kind in ("point", "directional")}
+    candidates = {
+        kind: tuple(light for light in _lights(frames, every, kind, height, source) if light.photo in kept)
+        for kind in ("point", "directional")
+    }
     kind = _stated_kind(folder, description, source)
     calibration = Calibration(camera, world_from_camera, height, candidates[kind or "point"], unit="scene")
     if not is_shadow_only:
@@ -91,6 +98,8 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
         tuple(shadow_paths) if shadow_paths else None,
         mask if mask.is_file() else None,
         ground_depth_path=find_ground_depth(folder),
+        photos_left_out=usable.left_out,
+        every_photo=usable.every,
     )
 
 

@@ -23,31 +23,38 @@ class ScenePhotos:
     left_out: tuple[Finding, ...] = ()
 
 
-def scene_photos(photos: Sequence[Path]) -> ScenePhotos:
+def scene_photos(photos: Sequence[Path], *beside: Sequence[Path]) -> ScenePhotos:
     """Leave out photos that cannot be read or have another size than most; copies stay, as each has a light.
 
     Args:
         photos: in the order of their lights, before any is left out.
+        beside: further pictures, one for each photo, as of its shadows: a photo counts if all of its pictures do.
 
     Raises:
         CaptureError: photos are left out, and fewer than FEWEST_LIT stay; names them all.
     """
-    found = each_or_fault(_size, photos)
-    wanted = usual_size([one for one in found if not isinstance(one, str)])
-    left_out = tuple(
-        Finding(path, "unreadable", one, 0.0, 0.0, True)
-        if isinstance(one, str)
-        else other_size(path, one, wanted, "lit")
-        for path, one in zip(photos, found, strict=True)
-        if one != wanted
-    )
-    rows = [row for row, one in enumerate(found) if one == wanted]
+    faults = [_faults(pictures) for pictures in (photos, *beside)]
+    left_out = tuple(one for found in faults for one in found.values())
+    rows = [row for row in range(len(photos)) if not any(row in found for found in faults)]
     if left_out and len(rows) < FEWEST_LIT:
         raise CaptureError(
             f"{len(rows)} of {len(photos)} photos in {photos[0].parent} can be used, {FEWEST_LIT} are needed. "
             f"{grouped(left_out)}. Replace these files."
         )
     return ScenePhotos([photos[row] for row in rows], rows, tuple(path.name for path in photos), left_out)
+
+
+def _faults(pictures: Sequence[Path]) -> dict[int, Finding]:
+    """Return what is wrong with pictures that should have one size, by their place among them."""
+    found = each_or_fault(_size, pictures)
+    wanted = usual_size([one for one in found if not isinstance(one, str)])
+    return {
+        row: Finding(path, "unreadable", one, 0.0, 0.0, True)
+        if isinstance(one, str)
+        else other_size(path, one, wanted, "lit")
+        for row, (path, one) in enumerate(zip(pictures, found, strict=True))
+        if one != wanted
+    }
 
 
 def _size(path: Path) -> tuple[int, int]:
