@@ -13,18 +13,11 @@ import numpy as np
 import shadowgraph
 import shadowgraph.run_result
 import viewer.page.page
-import viewer.panels.differences
-import viewer.panels.inspect
-import viewer.panels.light
-import viewer.panels.material
-import viewer.panels.save
 import viewer.report.report
 import viewer.stage.page
 from capture.intake.parts import Parts
-from reconstruct.evaluate.deviation import load_reference
 from reconstruct.export.export import ExportOptions, export
 from reconstruct.run.queue import Queue
-from reconstruct.solve.checkpoint import newest_surface
 from viewer.page.guard import GuardedServer
 from viewer.stage.pack_file import stage_pack
 from viewer.stage.page import stage_page
@@ -60,16 +53,14 @@ def exported(name: str) -> Callable[[Path], int]:
 
 
 def visited(run: Path) -> int:
-    """The page, with every photo and every tab shown."""
+    """The page, with every photo shown."""
     server = GuardedServer("127.0.0.1", ANY_PORT)
     page = viewer.page.page.Page(run, server)
     for _ in range(3):
         page.refresh()
     for index in range(min(8, len(page._lights))):
         page.choose_photo(index)
-    newest_surface(run / "checkpoint.safetensors")
     shown = [page.controls.status_html(), *(str(getattr(h, "content", "")) for h in _handles(server))]
-    page.close()
     server.stop()
     if any("<script>alert" in text or "<img src=x" in text for text in shown):
         raise RuntimeError("text of the folder became markup of the page")
@@ -109,12 +100,6 @@ def staged(run: Path) -> int:
     return 0
 
 
-def compared(run: Path) -> int:
-    """The run as the reference of another."""
-    load_reference(run)
-    return 0
-
-
 FRESH = {
     "report": ["report", "{run}"],
     "report --bundle": ["report", "{run}", "--bundle", "{out}/b.zip", "--with-pictures"],
@@ -129,7 +114,6 @@ FRESH = {
 COMMANDS: dict[str, Callable[[Path], int]] = {
     **{name: told(words) for name, words in FRESH.items() if not name.startswith("export")},
     "view": visited,
-    "view --reference": compared,
     "RunResult": looked_at,
     "studio": listed,
     "stage": staged,

@@ -21,6 +21,8 @@ import trimesh
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from viewer.display.pictures import depth_picture, mesh_picture, normal_picture
+
 from calibration.calibrated_views import load_views
 from calibration.calibration import Calibration
 from calibration.light import Light
@@ -31,7 +33,6 @@ from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
 from reconstruct.source.source import open_source
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.display.pictures import depth_picture, mesh_picture, normal_picture
 
 PICTURES = Path(__file__).parent / "pictures"
 HEIGHT = 300  # px of every panel

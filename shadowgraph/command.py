@@ -40,7 +40,7 @@ def _view(command: View, console: Console) -> None:
     from viewer.page.serve import view
 
     opens = webbrowser.open if console.is_terminal and not command.no_open else None
-    view(command.run, command.host, command.port, reference=command.reference, opens=opens)
+    view(command.run, command.host, command.port, opens=opens)
 
 
 def _export(command: Export, console: Console) -> None:

@@ -138,9 +138,6 @@ class View:
     """Address to listen on. Anything but 127.0.0.1 lets others on the network see the page."""
     port: int = 8080
     """The next free one is taken where this one is busy."""
-    reference: Given[Path] = None
-    """A mesh file or the folder of another run: the page can colour this run by its distance from it. A file without a
-    unit is read in the unit of this run."""
     no_open: Flag = False
     """Do not open the browser, which a terminal otherwise does; print the address only."""
     debug: Flag = False

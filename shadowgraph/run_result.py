@@ -15,8 +15,8 @@ from capture.files.title import title_of
 from reconstruct.fields import Fields
 from reconstruct.stored_run.documents import lit_photos
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.display.pictures import data_uri, mesh_picture
 from viewer.display.run_follower import size_text
+from viewer.report.drawing import data_uri, mesh_picture
 from viewer.report.pictures import view_from_camera
 
 NEEDED = ("calibration.json", "fields.safetensors", "mesh.ply", "report.json")

@@ -12,6 +12,7 @@ from PIL import Image
 
 from viewer.page.guard import GuardedServer
 from viewer.page.page import Page
+from viewer.page.visitors import Visitors
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
@@ -27,25 +28,30 @@ NO_DRAWING = """for (const kind of [WebGLRenderingContext, WebGL2RenderingContex
 
 
 class Followed:
-    """A run folder with its page, looked at again and again as `view` does."""
+    """A run folder with the pages of its visitors, looked at again and again as `view` does."""
 
     def __init__(self, run_dir: Path, server: GuardedServer | None = None):
         self.run_dir = run_dir
         self.server = server or GuardedServer("127.0.0.1", 0)
-        self.page = Page(run_dir, self.server)
+        self.visitors = Visitors(run_dir, self.server)
         self.url = f"http://localhost:{self.server.get_port()}"
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._follow, daemon=True)
         self._thread.start()
 
+    @property
+    def page(self) -> Page:
+        """That of the one visitor who is there."""
+        (page,) = self.visitors.pages.values()
+        return page
+
     def _follow(self) -> None:
         while not self._end.wait(REFRESH_S):
-            self.page.refresh()
+            self.visitors.poll()
 
     def close(self) -> None:
         self._end.set()
         self._thread.join()
-        self.page.close()
         self.server.stop()
 
 
@@ -85,14 +91,14 @@ def open_page(browser, url, is_drawn: bool = True):
         tab.add_init_script(NO_DRAWING)
     tab.set_default_timeout(PATIENCE_MS)
     bad = []
-    tab.on("console", lambda message: bad.append(message.text) if message.type == "error" else None)
+
+    def heard(message) -> None:  # viser takes a picture's blob away when it lays its panels out anew, loaded or not
+        if message.type == "error" and not message.location["url"].startswith("blob:"):
+            bad.append(message.text)
+
+    tab.on("console", heard)
     tab.on("pageerror", lambda error: bad.append(str(error)))
     tab.on("request", lambda r: None if r.url.startswith((url, "data:", "blob:", "ws:")) else bad.append(r.url))
     tab.goto(url)
     tab.wait_for_selector("canvas")
     return tab, bad
-
-
-def pictures(tab) -> list[str]:
-    """What the pictures in the panels show."""
-    return tab.eval_on_selector_all("img", "all => all.map(img => img.src)")

@@ -54,9 +54,7 @@ LONGEST_FIRST = (  # seconds of a file are not known before it ran: these took 8
     "test_relief",
     "test_declared_lights",
     "test_camera",
-    "test_inspect_browser",
     "test_run_browser",
-    "test_save_panel",
 )
 CHECKED = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts)

@@ -124,7 +124,6 @@ READERS = (
     "reconstruct.export.",  # what was just written, read back as a check, and a map that a person names
     "reconstruct.mesh.",  # the same
     "viewer.stage.page",  # the same, and the page's own parts
-    "viewer.panels.save",  # the same
     "reconstruct.run_folder.",  # lock, log and hashes of what a run itself writes
     "reconstruct.run.batch",  # the log of a run that it started
 )

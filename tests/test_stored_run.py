@@ -31,7 +31,6 @@ from reconstruct.export.export import export
 from reconstruct.fields import load_fields
 from reconstruct.mesh.mesh import vertex_colours
 from reconstruct.run.bundle import write_bundle
-from reconstruct.solve.checkpoint import newest_surface
 from reconstruct.stored_run.maps import read_thumbnail
 from reconstruct.stored_run.ply import read_mesh
 from reconstruct.stored_run.stored_run import StoredRun
@@ -67,7 +66,6 @@ def read_all(run: Path) -> list[str]:
     follower = RunFollower(run)
     assert status(follower.log(), follower.is_running()).title
     follower.thumbnail("photo_00.jpg")
-    newest_surface(run / "checkpoint.safetensors")
     results = read_results(run)
     assert "\n" not in "".join(said)
     return [*said, *results.problems]

@@ -117,7 +117,7 @@ def test_one_click_makes_and_downloads_the_page_under_the_title(browser, folder)
             tab.close()
 
 
-@pytest.mark.parametrize("button", ["Fill the window", "Rename", "Inspect in 3D", "All captures"])
+@pytest.mark.parametrize("button", ["Fill the window", "Rename", "All captures"])
 @marked
 def test_keys_reach_the_result_while_a_button_has_the_focus(browser, folder, button):  # noqa: F811
     with served(folder) as (_, _, owner):

@@ -2,7 +2,6 @@
 
 import gc
 import weakref
-from pathlib import Path
 
 import fake_run
 import pytest
@@ -10,7 +9,6 @@ from chromium import open_page
 from waiting import wait_until
 
 from viewer.page.guard import GuardedServer
-from viewer.page.page import KeptReadings
 from viewer.page.visitors import Visitors
 
 pytestmark = pytest.mark.browser
@@ -34,12 +32,11 @@ def test_what_one_visitor_switches_the_other_does_not_see_and_who_leaves_is_forg
             tabs.append(open_page(browser, address, is_drawn=False)[0])
             polled(lambda number=number: len(visitors.pages) == number + 1)
         pages = list(visitors.pages.values())
-        polled(lambda: all(page.tabs.result_panels for page in pages))
+        polled(lambda: all(page._mesh_name == "mesh.ply" for page in pages))
         tabs[0].get_by_text("Show", exact=True).click()
         tabs[0].get_by_label("Surface").uncheck()
         polled(lambda: not pages[0].controls.shows("Surface"))
         assert pages[1].controls.shows("Surface")
-        assert pages[0]._final_mesh is pages[1]._final_mesh  # read once
         gone = weakref.ref(pages.pop(0))
         tabs[0].close()
         polled(lambda: list(visitors.pages.values()) == pages)
@@ -48,16 +45,4 @@ def test_what_one_visitor_switches_the_other_does_not_see_and_who_leaves_is_forg
         tabs[1].close()
         polled(lambda: not visitors.pages)
     finally:
-        visitors.close()
         server.stop()
-
-
-def test_a_file_is_read_once_until_it_changes(tmp_path: Path):
-    file, kept, reads = tmp_path / "mesh.ply", KeptReadings(), []
-    file.write_text("one")
-    for _ in range(2):
-        assert kept.get(file, lambda: reads.append(1) or file.read_text()) == "one"
-    file.write_text("another")
-    assert kept.get(file, file.read_text) == "another"
-    assert kept.get(file, lambda: 7, "count") == 7
-    assert len(reads) == 1

@@ -1,6 +1,5 @@
-"""Predicted photos of a calibrated scene, for comparison with the real photos during and after a run."""
+"""Predicted photos of a calibrated scene, for comparison with the real photos."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -9,12 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from calibration.calibration import Calibration
-from calibration.camera import Camera
 from calibration.light import Light
 from reconstruct.fields import Fields
-from reconstruct.render.g_buffer import RenderView, surface_maps
+from reconstruct.render.g_buffer import RenderView
 from reconstruct.render.relight import lit_share, relight
-from reconstruct.sdf.grid import SdfGrid
 
 NO_LIGHT = 1e-12  # squared radiance: a pixel that no photo lights has no albedo
 
@@ -32,32 +29,6 @@ def shadow_picture(view: RenderView, calibration: Calibration, photo: str) -> Fl
     """Return 1 at the view's pixels where light of one photo arrives, 0 where none does."""
     share = torch.stack([lit_share(view, light) for light in _lights_of(calibration, photo)]).amax(0)
     return share[..., None].expand(*share.shape, 3)
-
-
-def snapshot(
-    surface: SdfGrid,
-    calibration: Calibration,
-    camera: Camera,
-    photos: Mapping[str, Float[np.ndarray, "height width 3"]],
-) -> RenderView:
-    """Return the view of a surface from the capture camera's pose, with its albedo estimated from photos.
-
-    Least squares: albedo = sum E I / sum E^2 over photos I and predicted pictures E of the scene with albedo 1.
-
-    Args:
-        photos: linear, by name, in the camera's size; if empty, the albedo is 1.
-    """
-    maps = surface_maps(surface, replace(calibration.posed_camera, camera=camera))
-    eye = torch.from_numpy(calibration.posed_camera.centre).float()
-    white = RenderView(maps, torch.ones(*maps.depth.shape, 3), surface, eye)
-    if not photos:
-        return white
-    above, below = torch.zeros_like(white.albedo), torch.full_like(white.albedo, NO_LIGHT)
-    for name, photo in photos.items():
-        radiance = photographed(white, calibration, name)
-        above += radiance * torch.from_numpy(photo).float()
-        below += radiance**2
-    return replace(white, albedo=above / below)
 
 
 def with_refined_lights(calibration: Calibration, fields: Fields) -> Calibration:

@@ -14,17 +14,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from capture.errors import UserError
-from capture.files.json_field import JsonField
 from capture.files.regular import why
-from reconstruct.fields import Verdict, checked_grid
+from reconstruct.fields import Verdict
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import thread_count
 from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, Log, read_checkpoint, write_checkpoint
 from reconstruct.solve.early_stopping import EarlyStopping
 from reconstruct.solve.light_refine import LightShift
-from reconstruct.tensor_file import parsed, read_tensors
+from reconstruct.tensor_file import parsed
 from reconstruct.views import Scenes, each
 
 VERSION = "9"
@@ -147,22 +145,6 @@ def _state(tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> SolveStat
         None if state["verdict"] is None else Verdict(**state["verdict"]),
         tuple(int(photo) for photo in state["left_out"]),
     )
-
-
-def newest_surface(path: Path) -> SdfGrid | None:
-    """Return the surface in a checkpoint of any run, for display; None if there is none, or it is damaged.
-
-    The checksum is not verified: that would take longer than everything else.
-    """
-    try:
-        stored = read_tensors(path)
-        tensors, header = stored.tensors, JsonField(parsed(stored.header, "state"), str(path))
-        if header["iteration"].count(0) == 0:
-            return checked_grid(tensors["start"], tensors["origin"], header["spacing"])
-        spacing = header["phi_spacing"]
-        return checked_grid(spacing.number() * tensors["phi"], tensors["phi_origin"].float(), spacing)
-    except (OSError, UserError, KeyError, ValueError, RuntimeError):
-        return None
 
 
 def _stopping(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> EarlyStopping:

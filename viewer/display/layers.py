@@ -2,10 +2,11 @@
 
 The page draws the world in its own axes, scaled so that the camera stands CAMERA_DISTANCE units from the ground it
 looks at: viser's clipping planes, shadow maps and handles are made for a few units, not for hundreds of millimetres.
+A Host is the server, whose scene all browsers share, or one browser, which then has a scene of its own.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import viser
@@ -16,11 +17,9 @@ from calibration.calibration import Calibration
 from calibration.light import Light
 from capture.photos.photo import decode_srgb
 from reconstruct.mesh.glb import write_glb
-from reconstruct.stored_run.ply import Triangles
-from viewer.display.pictures import vertex_colours
+from reconstruct.stored_run.ply import Triangles, read_mesh, read_triangles
 
-if TYPE_CHECKING:  # finished meshes only, see reconstruct/stored_run/ply.py
-    import trimesh
+Host = viser.ViserServer | viser.ClientHandle
 
 CAMERA_DISTANCE = 5.0  # page units
 GROUND_SIZE = 200.0  # page units: past the horizon of every view, short of the far plane
@@ -34,7 +33,7 @@ BLACK, WHITE = (0, 0, 0), (255, 255, 255)
 FROM_BELOW = ((200, 190, 180), 2.0)  # colour and strength of what a table in daylight throws back
 BY_NIGHT = ((90, 85, 80), 0.7)  # so that what the lamp does not reach is neither black nor flat
 CLAY = (200, 160, 120)  # of the growing mesh: its own colours come at the end, and the ground is grey
-LARGE_PREVIEW_FACES = 400_000  # above this a mesh is thinned for the page only: 12 MB a time
+MOST_FACES = 400_000  # above this a mesh is simplified for the page only: 12 MB a time
 FIRST_FOV = float(np.radians(55.0))  # vertical
 RAISED = 0.58  # of half the height of an upright window: how far above its middle the object is shown
 FRAMED = 0.75  # of the window's shorter side, by the sphere around a finished object
@@ -54,10 +53,6 @@ class PageScale:
     def to_page(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Convert world points to the page."""
         return world * self.factor
-
-    def to_world(self, page: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Convert points of the page to the world."""
-        return page / self.factor
 
 
 def page_scale(calibration: Calibration) -> PageScale:
@@ -123,22 +118,22 @@ def framed_view(
     return target + back * distance, target
 
 
-def light_room(server: viser.ViserServer, has_lamp: bool) -> None:
+def light_room(host: Host, has_lamp: bool) -> None:
     """Add ambient light: a faint one beside a lamp, else daylight and what the table reflects upwards."""
-    server.scene.configure_default_lights(not has_lamp, cast_shadow=False)
+    host.scene.configure_default_lights(not has_lamp, cast_shadow=False)
     sky, (below, strength) = (WHITE, BY_NIGHT) if has_lamp else (BLACK, FROM_BELOW)
-    server.scene.add_light_hemisphere(
+    host.scene.add_light_hemisphere(
         "/room", sky_color=sky, ground_color=below, intensity=strength, position=(0.0, 0.0, 1.0)
     )
 
 
-def draw_ground(server: viser.ViserServer, calibration: Calibration, scale: PageScale) -> list[viser.SceneNodeHandle]:
+def draw_ground(host: Host, calibration: Calibration, scale: PageScale) -> list[viser.SceneNodeHandle]:
     """Draw the ground plane, with lines every 10 and 50 mm, or every tenth and half of a scene unit."""
     cell = scale.factor * (10.0 if calibration.unit == "mm" else 0.1)
     centre = scale.to_page(scale.centre)
     corners = 0.5 * GROUND_SIZE * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]])
     below = np.array([0, 0, 2e-3 * CAMERA_DISTANCE])  # no flicker with the grid, or with the mesh's base
-    plane = server.scene.add_mesh_simple(
+    plane = host.scene.add_mesh_simple(
         "/ground/plane",
         corners,
         np.array([[0, 1, 2], [0, 2, 3]]),
@@ -147,7 +142,7 @@ def draw_ground(server: viser.ViserServer, calibration: Calibration, scale: Page
         cast_shadow=False,
         position=centre - below,
     )
-    grid = server.scene.add_grid(
+    grid = host.scene.add_grid(
         "/ground/grid",
         GROUND_SIZE,
         GROUND_SIZE,
@@ -164,16 +159,14 @@ def draw_ground(server: viser.ViserServer, calibration: Calibration, scale: Page
     return [plane, grid]
 
 
-def draw_camera(
-    server: viser.ViserServer, calibration: Calibration, scale: PageScale, number: int = 0
-) -> viser.CameraFrustumHandle:
+def draw_camera(host: Host, calibration: Calibration, scale: PageScale, number: int = 0) -> viser.CameraFrustumHandle:
     """Draw the camera as a frustum; its `image` is the photo that is looked at.
 
     Args:
         number: of the view, where there are several.
     """
     camera, pose = calibration.camera, calibration.world_from_camera
-    return server.scene.add_camera_frustum(
+    return host.scene.add_camera_frustum(
         f"/camera_{number}" if number else "/camera",
         2 * float(np.arctan(0.5 * camera.height / camera.fy)),
         camera.width / camera.height,
@@ -212,11 +205,11 @@ class LightMarker:
         self.halo.remove()
 
 
-def draw_light(server: viser.ViserServer, index: int, light: Light, scale: PageScale) -> LightMarker:
+def draw_light(host: Host, index: int, light: Light, scale: PageScale) -> LightMarker:
     """Draw a light as a ball in an ellipsoid of two sigma; an unused one as a grey wire ball without ellipsoid."""
     place = light_position(light, scale)
     colour = AMBER if light.used else GREY
-    bulb = server.scene.add_icosphere(
+    bulb = host.scene.add_icosphere(
         f"/lights/{index}/bulb",
         BULB_RADIUS,
         colour,
@@ -228,7 +221,7 @@ def draw_light(server: viser.ViserServer, index: int, light: Light, scale: PageS
     )
     reach = light.sigma * (scale.factor if light.position is not None else CAMERA_DISTANCE)
     a, b, c = np.maximum(SIGMAS_SHOWN * reach, LEAST_HALO).tolist()
-    halo = server.scene.add_icosphere(
+    halo = host.scene.add_icosphere(
         f"/lights/{index}/uncertainty",
         1.0,
         colour,
@@ -242,38 +235,36 @@ def draw_light(server: viser.ViserServer, index: int, light: Light, scale: PageS
     return LightMarker(light, bulb, halo)
 
 
-def draw_mesh(
-    server: viser.ViserServer,
-    mesh: "trimesh.Trimesh",
-    scale: PageScale,
-    visible: bool = True,
-    is_lit: bool = True,
-    glb: bytes | None = None,
-) -> viser.GlbHandle:
-    """Draw the final surface in its vertex colours, lit by the scene or exactly in these colours.
+def page_mesh(path: Path) -> Triangles:
+    """Read a finished mesh, simplified where it has more triangles than a browser shows at once.
 
-    Args:
-        glb: what `mesh_glb` makes of it, where that is known.
+    Raises:
+        ReconstructionError: it is none that a run writes.
     """
-    glb = mesh_glb(mesh, is_lit) if glb is None else glb
-    return server.scene.add_glb("/mesh", glb, scale=scale.factor, visible=visible, cast_shadow=is_lit)
+    found = read_triangles(path)
+    if len(found.faces) <= MOST_FACES:
+        return found  # without trimesh: beside a run its imports would be felt
+    from reconstruct.mesh.mesh import vertex_colours
+    from reconstruct.mesh.simplify import simplified
+
+    mesh = simplified(read_mesh(path), MOST_FACES)
+    places, normals = (np.asarray(v, np.float32) for v in (mesh.vertices, mesh.vertex_normals))
+    return Triangles(places, np.asarray(mesh.faces, np.int32), normals, np.asarray(vertex_colours(mesh)))
 
 
-def draw_preview(
-    server: viser.ViserServer, mesh: Triangles, scale: PageScale, visible: bool
-) -> viser.MeshHandle | viser.GlbHandle:
-    """Draw the growing surface in the place of the final one: in the colours of the photos, or like clay without."""
-    if mesh.colours is not None and mesh.normals is not None:  # without trimesh: beside a run its imports would be felt
+def draw_mesh(host: Host, mesh: Triangles, scale: PageScale, visible: bool) -> viser.MeshHandle | viser.GlbHandle:
+    """Draw the surface, growing or finished: in the colours of the photos, or like clay where it has none yet."""
+    if mesh.colours is not None and mesh.normals is not None:
         glb = write_glb(mesh.vertices, mesh.normals, decode_srgb(mesh.colours[:, :3]), mesh.faces)
-        return server.scene.add_glb("/mesh", glb, scale=scale.factor, visible=visible)
-    return server.scene.add_mesh_simple(
+        return host.scene.add_glb("/mesh", glb, scale=scale.factor, visible=visible)
+    return host.scene.add_mesh_simple(
         "/mesh", mesh.vertices, mesh.faces, color=CLAY, side="double", scale=scale.factor, visible=visible
     )
 
 
-def draw_hull(server: viser.ViserServer, hull: Triangles, scale: PageScale, visible: bool) -> viser.MeshHandle:
+def draw_hull(host: Host, hull: Triangles, scale: PageScale, visible: bool) -> viser.MeshHandle:
     """Draw the shadow hull, transparent: the space that no lit ground has proven empty."""
-    return server.scene.add_mesh_simple(
+    return host.scene.add_mesh_simple(
         "/hull",
         hull.vertices,
         hull.faces,
@@ -287,59 +278,6 @@ def draw_hull(server: viser.ViserServer, hull: Triangles, scale: PageScale, visi
     )
 
 
-def mesh_glb(mesh: "trimesh.Trimesh", is_lit: bool = True) -> bytes:
-    """Return a GLB for the page: same axes and unit, linear colours, a matt material.
-
-    glTF reads vertex colours as linear light, and a mesh without a material as bare metal, which is black without
-    surroundings to mirror.
-
-    Args:
-        is_lit: by the scene's lights; else it shows its colours as they are (KHR_materials_unlit).
-    """
-    import trimesh
-
-    if len(mesh.faces) > LARGE_PREVIEW_FACES:
-        mesh = _thinned(mesh)
-    linear = np.round(255 * decode_srgb(vertex_colours(mesh))).astype(np.uint8)
-    shown = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=linear, process=False)
-    glb = shown.export(file_type="glb", include_normals=False, tree_postprocessor=_matt if is_lit else _unlit)
-    assert isinstance(glb, bytes)
-    return glb
-
-
-def _thinned(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
-    """The mesh with vertices merged on a grid fine enough that a screen does not show it."""
-    import trimesh
-
-    cell = mesh.extents.max() / np.sqrt(LARGE_PREVIEW_FACES / 4)
-    while True:
-        keys = np.floor((mesh.vertices - mesh.bounds[0]) / cell).astype(np.int64)
-        keys = np.ravel_multi_index(tuple(keys.T), tuple(keys.max(0) + 1))
-        _, first, group = np.unique(keys, return_index=True, return_inverse=True)
-        faces = group[mesh.faces]
-        faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
-        if len(faces) <= LARGE_PREVIEW_FACES:
-            return trimesh.Trimesh(
-                mesh.vertices[first], faces, vertex_colors=vertex_colours(mesh)[first], process=False
-            )
-        cell *= 1.05 * np.sqrt(len(faces) / LARGE_PREVIEW_FACES)  # a surface has as many faces as cells of its area
-
-
-def _matt(tree: dict) -> None:
-    """Give every primitive one rough, non-metallic, double-sided material."""
-    tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}]
-    for mesh in tree["meshes"]:
-        for primitive in mesh["primitives"]:
-            primitive["material"] = 0
-
-
-def _unlit(tree: dict) -> None:
-    """As `_matt`, without light."""
-    _matt(tree)
-    tree["materials"][0]["extensions"] = {"KHR_materials_unlit": {}}
-    tree["extensionsUsed"] = ["KHR_materials_unlit"]
-
-
 @dataclass(frozen=True)
 class LampMarker:
     """The drawing of the light that can be dragged."""
@@ -347,22 +285,18 @@ class LampMarker:
     handle: viser.TransformControlsHandle
     light: viser.PointLightHandle
     bulb: viser.IcosphereHandle
-    server: viser.ViserServer
-
-    def resize(self, radius: float) -> None:
-        """Draw the lamp as large as it shines, page units, but never too small to be seen."""
-        self.bulb.scale = max(1.0, radius / LAMP_RADIUS)
+    host: Host
 
     def show(self, is_shown: bool) -> None:
         """Show or hide all of it, and let the lamp, or else daylight, light the surface."""
         self.handle.visible = self.light.visible = self.bulb.visible = is_shown
-        light_room(self.server, has_lamp=is_shown)
+        light_room(self.host, has_lamp=is_shown)
 
 
-def draw_lamp(server: viser.ViserServer, place: Float[np.ndarray, "3"], floor: float) -> LampMarker:
+def draw_lamp(host: Host, place: Float[np.ndarray, "3"], floor: float) -> LampMarker:
     """Draw a light with a handle at `place`, page units; it cannot be dragged below the height `floor`."""
     reach = 4 * CAMERA_DISTANCE
-    handle = server.scene.add_transform_controls(
+    handle = host.scene.add_transform_controls(
         "/lamp",
         0.9,
         line_width=4.0,
@@ -370,11 +304,9 @@ def draw_lamp(server: viser.ViserServer, place: Float[np.ndarray, "3"], floor: f
         translation_limits=((-reach, reach), (-reach, reach), (floor + BULB_RADIUS, floor + reach)),
         position=place,
     )
-    bulb = server.scene.add_icosphere(
-        "/lamp/bulb", LAMP_RADIUS, (255, 244, 214), cast_shadow=False, receive_shadow=False
-    )
+    bulb = host.scene.add_icosphere("/lamp/bulb", LAMP_RADIUS, (255, 244, 214), cast_shadow=False, receive_shadow=False)
     # candela in three.js: a white surface at the camera's distance is two thirds of full white
-    light = server.scene.add_light_point(
+    light = host.scene.add_light_point(
         "/lamp/light", color=(255, 236, 210), intensity=2 / 3 * np.pi * CAMERA_DISTANCE**2, cast_shadow=True
     )
-    return LampMarker(handle, light, bulb, server)
+    return LampMarker(handle, light, bulb, host)

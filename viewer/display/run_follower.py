@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.errors import UserError
-from capture.files.regular import open_regular
+from capture.files.regular import is_own_folder, open_regular
 from reconstruct.run_folder.folder import LARGEST_LOG, LOG
 from reconstruct.run_folder.forecast import STAGE_NAMES, Forecast
 from reconstruct.run_folder.lock import LOCK, is_abandoned
 from reconstruct.run_folder.requests import PAUSED, REQUESTS_FOLDER
 from reconstruct.stored_run.documents import log_lines
 from reconstruct.stored_run.maps import THUMBS, read_thumbnail
-from reconstruct.stored_run.stored_run import CALIBRATION, DETAIL, FIELDS, MESH
+from reconstruct.stored_run.stored_run import CALIBRATION, FIELDS, MESH
 
 FIT_WORDS = {
     "loss_shadow": ("Shadows", "How far computed shadows are from those in the photos."),
@@ -27,8 +27,8 @@ FIT_WORDS = {
     "loss_colour": ("Colour", "How far computed colours are from those in the photos."),
 }
 
-CHECKPOINT, HULL, PREVIEW = "checkpoint.safetensors", "hull.ply", "preview.ply"
-SHOWN = (LOG, LOCK, CALIBRATION, PREVIEW, HULL, MESH, FIELDS, DETAIL, CHECKPOINT, THUMBS, REQUESTS_FOLDER)  # on a page
+HULL, PREVIEW = "hull.ply", "preview.ply"
+SHOWN = (LOG, LOCK, CALIBRATION, PREVIEW, HULL, MESH, FIELDS, THUMBS, REQUESTS_FOLDER)  # on a page
 HEAD = 256  # bytes of a log by which it is known again: more than its first time stamp
 AFTER_MESH = (
     "detail",
@@ -70,10 +70,6 @@ class RunFollower:
         is_new = self._seen.get(name) != mark
         self._seen[name] = mark
         return is_new
-
-    def any_changed(self, *names: str) -> bool:
-        """Return whether `changed` is true of any of these. It is called for all."""
-        return any([self.changed(name) for name in names])
 
     def has_news(self) -> bool:
         """Return whether a file that the page shows has changed since the last call. No file is read.
@@ -130,6 +126,11 @@ class RunFollower:
             return read_thumbnail(self.path, photo)
         except (OSError, UserError):
             return None
+
+    def thumbnails(self) -> list[str]:
+        """Return the names of the small pictures of photos that are there, in order."""
+        folder = self.path / THUMBS
+        return sorted(path.name for path in folder.glob("[!.]*.jpg")) if is_own_folder(folder) else []
 
 
 def stage_of(lines: Sequence[Mapping[str, Any]]) -> str:

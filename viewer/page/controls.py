@@ -1,17 +1,22 @@
-"""Controls: the status, the tabs, the layers and the curves of the page. They handle no geometry and no files."""
+"""Controls: the status, the steering, the photos, the layers and the curves of the page. They handle no geometry."""
 
 import html
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import viser
 import viser.uplot
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
+from capture.files.title import title_of
 from reconstruct.run_folder.forecast import duration_text, left_text
+from viewer.display.layers import Host
 from viewer.display.run_follower import Status, residual_text
-from viewer.widgets.picture_panel import MUTED, PicturePanel
+from viewer.page.steering import Steering
 
+MUTED = "opacity:.68;font-size:.82rem"
 BRAND = (214, 137, 16)
 LAYERS = ("Surface", "Shadow hull", "Ground", "Camera", "Lights", "Uncertainty", "Your lamp")
 OFF_AT_FIRST = ("Shadow hull",)
@@ -22,39 +27,42 @@ LAYER_HINTS = {
     "Camera": "Where the photos were taken from, with the chosen photo",
     "Lights": "Where the flashlight was held; grey ones could not be used",
     "Uncertainty": "The light lies in this ellipsoid, with about 95 % certainty along each axis",
-    "Your lamp": "A light you can drag, once the surface is finished",
+    "Your lamp": "A light to drag: the surface shows its light and shadow",
 }
 TO_STAGE = (
     '<div style="padding:0 .8rem .7rem"><a href="/stage/" target="_self" style="color:inherit;font-weight:600">'
-    "Open the picture: lit by the pointer, to turn, to annotate</a></div>"
+    "Open the result: to light, turn, measure, note and save</a></div>"
 )
 CURVE_COLOURS = ("#f5a524", "#5b9dff", "#4cc38a", "#e5709b", "#a78bfa", "#9aa3b2", "#22c1c3", "#e46c3b")
 
 
 class Controls:
-    """All panels of the page. The `show_*` methods may be called from any thread and send only what changed."""
+    """All controls of the page. The `show_*` methods may be called from any thread and send only what changed."""
 
-    def __init__(self, server: viser.ViserServer, title: str, change_layers: Callable[[], None]):
-        """Lay the panels out.
+    def __init__(
+        self, host: Host, run_dir: Path, change_layers: Callable[[], None], choose_photo: Callable[[int], None]
+    ):
+        """Lay the controls out.
 
         Args:
-            title: the run's name.
             change_layers: called in viser's thread pool when a layer is switched on or off.
+            choose_photo: called there with the index of a photo, from 0, when a visitor moves the slider.
         """
-        self._gui = server.gui
+        self._gui = gui = host.gui
         self._change_layers = change_layers
         self._curves: viser.GuiUplotHandle | None = None
         self._curve_names: tuple[str, ...] = ()
-        self._gui.set_panel_label(f"Shadowgraph · {title}")
-        self._gui.main_panel.dock_right()
-        self._gui.main_panel.set_width(330)
-        self._add_main_panel()
-        self.pictures = PicturePanel(self._gui)
-
-    def _add_main_panel(self) -> None:
-        gui = self._gui
+        gui.set_panel_label(f"Shadowgraph · {title_of(run_dir)}")
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(330)
         self._status = gui.add_html("")
-        self._tabs = gui.add_tab_group(visible=False)
+        self.steering = Steering(gui, run_dir)
+        self._photo_folder = gui.add_folder("Photos", visible=False)
+        with self._photo_folder:
+            self._slider = gui.add_slider("Photo", 1, 2, 1, 1, hint="Each photo has its own light: the lamp goes there")
+            self._caption = gui.add_html("")
+        self._photo: viser.GuiImageHandle | None = None
+        self._slider.on_update(lambda event: choose_photo(self.photo_index()) if event.client is not None else None)
         with gui.add_folder("Show", expand_by_default=False):
             self._layers = {n: gui.add_checkbox(n, n not in OFF_AT_FIRST, hint=LAYER_HINTS[n]) for n in LAYERS}
             self._dark = gui.add_checkbox("Dark page", True)
@@ -64,16 +72,15 @@ class Controls:
             box.on_update(lambda _: self._change_layers())
         self._curve_folder = gui.add_folder("How well it fits", expand_by_default=False, visible=False)
 
-    def add_tab(self, title: str) -> viser.GuiTabHandle:
-        """Add a tab behind the others. It has no icon, so that all tabs fit in one row."""
-        self._tabs.visible = True
-        return self._tabs.add_tab(title)
-
     # --- what is read from the controls ------------------------------------------------------------------------------
 
     def shows(self, layer: str) -> bool:
         """Return whether this one of LAYERS is switched on."""
         return bool(self._layers[layer].value)
+
+    def photo_index(self) -> int:
+        """Return the index of the chosen photo, from 0."""
+        return int(self._slider.value) - 1
 
     def status_html(self) -> str:
         """Return the status card as it was sent."""
@@ -81,11 +88,25 @@ class Controls:
 
     # --- what is shown -----------------------------------------------------------------------------------------------
 
-    def show_status(self, now: Status, remark: str = "", has_picture: bool = False) -> None:
-        """Show stage, n of m, time left and message, a remark about the mesh or a problem, and the way to the stage."""
-        content = _status_card(now, remark) + (TO_STAGE if has_picture else "")
+    def follow(self, now: Status, lines: Sequence[Mapping[str, Any]], remark: str, has_picture: bool) -> None:
+        """Show stage, n of m, time left and message, the steering, a remark or problem, and the way to the stage."""
+        content = _status_card(now, remark, self.steering.follow(now, lines)) + (TO_STAGE if has_picture else "")
         if content != self._status.content:
             self._status.content = content
+
+    def show_photo(self, index: int, count: int, words: str, picture: UInt8[np.ndarray, "h w 3"] | None) -> None:
+        """Show one of `count` photos, with a line about it; None: there is no picture of it yet."""
+        self._slider.max, self._slider.disabled = max(count, 2), count < 2
+        self._slider.value = index + 1
+        self._photo_folder.visible = True
+        if self._photo is not None:
+            self._photo.visible = picture is not None
+        if picture is not None and self._photo is None:
+            with self._photo_folder:
+                self._photo = self._gui.add_image(picture, format="jpeg")
+        elif picture is not None and self._photo is not None:
+            self._photo.image = picture
+        self._caption.content = f'<div style="padding:0 .8rem .5rem;{MUTED}">{html.escape(words)}</div>'
 
     def _set_theme(self) -> None:
         self._gui.configure_theme(
@@ -129,7 +150,7 @@ def continued(seconds: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"])
     return np.exp(np.interp(seconds, seconds[known], np.log(values[known])))
 
 
-def _status_card(now: Status, remark: str) -> str:
+def _status_card(now: Status, *remarks: str) -> str:
     """Return the status as HTML. Text from files is escaped: a photo's name must not become part of the page."""
     bar = ""
     if not now.is_over:
@@ -142,7 +163,7 @@ def _status_card(now: Status, remark: str) -> str:
     facts.append(
         f"{duration_text(now.elapsed_s)} so far" if not now.is_over else f"took {duration_text(now.elapsed_s)}"
     )
-    lines = [" · ".join(f for f in facts if f), now.message, remark]
+    lines = [" · ".join(f for f in facts if f), now.message, *remarks]
     body = "".join(f'<div style="{MUTED};margin-top:.15rem">{html.escape(line)}</div>' for line in lines if line)
     return (
         '<div style="padding:.55rem .8rem .7rem">'

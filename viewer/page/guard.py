@@ -1,8 +1,9 @@
 """A viser server that answers only its own page: no tunnel, no foreign origin, no foreign host name.
 
 viser 1.1 accepts a WebSocket from any origin, so any web page open in the user's browser could read the scene and move
-its controls, also on 127.0.0.1. It has no hook for the handshake, so this module puts a check before its request
-handler. A visitor over a network sends the token of the printed address once, and a cookie from then on.
+its controls, also on 127.0.0.1. It passes none of the options on that `websockets` has against that, and a proxy before
+it would leave its own port open; so while viser opens its socket, the function that opens it gets these options too.
+A visitor over a network sends the token of the printed address once, and a cookie from then on.
 """
 
 import asyncio
@@ -27,7 +28,7 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from capture.errors import UserError
-from viewer.page.message_filter import LARGEST_FRAME, InvalidMessage, MessageFilter
+from viewer.page.message_filter import InvalidMessage, refuse_strange
 from viewer.stage.files import HEADERS, HTML, StageFile, StageFiles
 
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
@@ -49,6 +50,7 @@ observer.observe(page, {attributeFilter: ["data-mantine-color-scheme"]});
 setTimeout(show, 8000);}
 </script>"""
 COOKIE = "shadowgraph"
+LARGEST_FRAME = 1 << 21  # bytes of a message: twice a stage document, so that one too large gets a sentence
 FRAMES_WAITING = 4  # of one connection: received messages that are held before they are read
 OWN_HEADERS = {
     # nothing is loaded from elsewhere, and no other page may show this one in a frame (clickjacking)
@@ -64,7 +66,7 @@ OWN_HEADERS = {
 
 
 class GuardedServer(viser.ViserServer):
-    """A ViserServer behind `is_own_page` and a MessageFilter, without its banner and its public share tunnel."""
+    """A ViserServer behind `is_own_page` and `refuse_strange`, without its banner and its public share tunnel."""
 
     def __init__(self, host: str, port: int, stage: StageFiles | None = None, title: str = "Shadowgraph"):
         """Serve on this host and port, or on the next free port, see `get_port`.
@@ -78,7 +80,7 @@ class GuardedServer(viser.ViserServer):
         """
         self.token = "" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)  # of the address; "": none needed
         with (
-            _guarded_handshakes(host, self.token, self._notify, stage, title) as guards,
+            _guarded_handshakes(host, self.token, stage, title) as guards,
             contextlib.redirect_stdout(io.StringIO()),
         ):
             super().__init__(host=host, port=port, verbose=False)
@@ -89,10 +91,6 @@ class GuardedServer(viser.ViserServer):
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Return None: any client may request the tunnel, and viser answers with this method."""
         return None
-
-    def _notify(self, words: str) -> None:
-        for client in self.get_clients().values():
-            client.add_notification("This file is too large", words, color="red")
 
 
 def is_loopback(host: str) -> bool:
@@ -231,35 +229,27 @@ async def _keep_document(connection: ServerConnection, stage: StageFiles) -> Non
             await connection.send(str(error))
 
 
-def _guarded_connection(notify: Callable[[str], object]) -> type[ServerConnection]:
-    class GuardedConnection(ServerConnection):
-        """Passes on the messages that its MessageFilter admits; any other message closes the connection."""
+class _GuardedConnection(ServerConnection):
+    """Closes at a message that our page does not send."""
 
-        def __init__(self, *args: Any, **options: Any):
-            super().__init__(*args, **options)
-            self._filter = MessageFilter(notify)
-
-        async def recv(self, decode: bool | None = None) -> Any:
-            while True:
-                message = await super().recv(decode)
-                if _is_stage_document(self.request):
-                    return message
-                try:
-                    if self._filter.admit(message):
-                        return message
-                except InvalidMessage as error:
-                    closing = asyncio.create_task(self.close(CloseCode.POLICY_VIOLATION, str(error)))
-                    while not closing.done():  # messages under way must be read, or the connection never closes
-                        await super().recv(decode)  # finally raises ConnectionClosed
-
-    return GuardedConnection
+    async def recv(self, decode: bool | None = None) -> Any:
+        message = await super().recv(decode)
+        if not _is_stage_document(self.request):
+            try:
+                refuse_strange(message)
+            except InvalidMessage as error:
+                closing = asyncio.create_task(self.close(CloseCode.POLICY_VIOLATION, str(error)))
+                while not closing.done():  # messages under way must be read, or the connection never closes
+                    await super().recv(decode)
+                await super().recv(decode)  # raises ConnectionClosed
+        return message
 
 
 @contextlib.contextmanager
 def _guarded_handshakes(
-    bound_host: str, token: str, notify: Callable[[str], object], stage: StageFiles | None, title: str
+    bound_host: str, token: str, stage: StageFiles | None, title: str
 ) -> Iterator[list[Callable[..., Any]]]:
-    """Put `_refusal` before the request handler of each websockets server that opens while the block runs.
+    """Open each websockets server with `_refusal` before its request handler while the block runs.
 
     Yields the list of guards that were installed; it is empty if no server opened.
     """
@@ -283,8 +273,8 @@ def _guarded_handshakes(
                 await handler(connection)
 
         guards.append(guard)
-        options |= {"max_size": LARGEST_FRAME, "max_queue": FRAMES_WAITING}
-        return serve(handle, *args, process_request=guard, create_connection=_guarded_connection(notify), **options)
+        options |= {"max_size": LARGEST_FRAME, "max_queue": FRAMES_WAITING, "create_connection": _GuardedConnection}
+        return serve(handle, *args, process_request=guard, **options)
 
     websockets.asyncio.server.serve = guarded_serve  # viser opens its socket inside its constructor, with this name
     try:

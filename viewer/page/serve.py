@@ -25,7 +25,6 @@ def view(
     port: int = 8080,
     once: bool = False,
     say: Callable[[str], object] = print,
-    reference: Path | None = None,
     opens: Callable[[str], object] | None = None,
 ) -> None:
     """Serve the page of a run folder until Ctrl-C, or, with `once`, until the run is over.
@@ -35,28 +34,21 @@ def view(
         host: 127.0.0.1 unless others shall see and use the page; they need the token of the printed address.
         port: if it is busy, the next free one is taken.
         say: called with each line about the address, once it is known.
-        reference: a mesh file or the folder of another run, to compare this one with.
         opens: called with the address, to show it in a browser.
 
     Raises:
-        UserError: it is not the folder of a run, or the reference cannot be read.
+        UserError: it is not the folder of a run.
     """
     refuse_no_run(Path(run_dir))
-    compared_with = None
-    if reference is not None:
-        from reconstruct.evaluate.deviation import load_reference
-
-        compared_with = load_reference(Path(reference))
     share_memory_among_threads()
     stage = StageFiles(Path(run_dir), "socket", home="/")
     server = GuardedServer(host, port, stage, f"{title_of(Path(run_dir))} - Shadowgraph")
-    visitors = Visitors(Path(run_dir), server, compared_with)
+    visitors = Visitors(Path(run_dir), server)
     gc.freeze()  # objects made by imports stay; without this each collection would scan them for 0.15 s
     start = "stage/" if stage.is_ready else ""
     for line in address_lines(host, server.get_port(), server.token, start):
         say(line)
-    for warm in (stage.warm, visitors.warm):
-        threading.Thread(target=warm, daemon=True).start()
+    threading.Thread(target=stage.warm, daemon=True).start()
     if opens is not None:
         opens(f"http://localhost:{server.get_port()}/{start}" + (f"?token={server.token}" if server.token else ""))
     given_back = time.monotonic()
@@ -70,7 +62,6 @@ def view(
     except KeyboardInterrupt:
         say("Page closed.")
     finally:
-        visitors.close()
         server.stop()
         gc.unfreeze()
 

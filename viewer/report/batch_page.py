@@ -16,9 +16,9 @@ from reconstruct.run.batch import LOGS, Outcome, Task
 from reconstruct.run_folder.forecast import duration_text
 from reconstruct.stored_run.ply import read_mesh
 from reconstruct.stored_run.stored_run import CALIBRATION, MESH
-from viewer.display.pictures import mesh_picture
 from viewer.display.run_follower import size_text
 from viewer.report import document as doc
+from viewer.report.drawing import mesh_picture
 from viewer.report.pictures import view_from_camera
 
 INDEX, THUMBNAIL = "index.html", "thumbnail.png"

@@ -15,8 +15,8 @@ from capture.files.atomic import atomic_file
 from capture.photos.photo import encode_srgb, read_photo
 from reconstruct.check.light_coverage import ShadowCover, directions, from_the_camera, side_in_words
 from reconstruct.check.verdict import CaptureCheck
-from viewer.display.pictures import enlarged
 from viewer.report import document as doc
+from viewer.report.drawing import enlarged
 from viewer.report.figures import coverage, lights_from_above
 
 PAGE = "check.html"

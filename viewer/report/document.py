@@ -3,7 +3,7 @@
 import html
 from collections.abc import Sequence
 
-from viewer.display.pictures import Picture, data_uri
+from viewer.report.drawing import Picture, data_uri
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # the page may load nothing
 STYLE = """

@@ -12,10 +12,10 @@ from calibration.board.board_scale import scale_parts
 from calibration.calibration import Calibration
 from reconstruct.fields import Fields
 from reconstruct.stored_run.maps import thumbnail_name
-from viewer.display.pictures import Picture, depth_picture, mesh_picture, normal_picture, reduced
 from viewer.display.run_follower import size_text
-from viewer.relighting.comparison import compare_result
 from viewer.report import document as doc
+from viewer.report.comparison import compare_result
+from viewer.report.drawing import Picture, depth_picture, mesh_picture, normal_picture, reduced
 
 THUMB_WIDTH = 180  # px, in the grid of photos
 MAP_WIDTH = 520  # px

@@ -36,7 +36,7 @@ export function usePanel(redraw) {
   keyList();
   byId("softness").value = Math.sqrt(lamp.radius / facts.largestLamp);
   if (served.home) {
-    const link = Object.assign(document.createElement("a"), { href: served.home, textContent: "Inspect this run in 3D" });
+    const link = Object.assign(document.createElement("a"), { href: served.home, textContent: "The photos, lights and cameras of this run, in 3D" });
     byId("home-link").append(link);
   }
   lightControls();

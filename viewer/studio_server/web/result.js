@@ -57,8 +57,7 @@ export function run(name, again) {
     return h("div", {},
       one.has_mesh ? stage(one) : h("p", { class: "bad" }, "This run has no result that could be shown: its mesh is missing. Start it again."),
       h("div", { class: "bar" }, one.has_mesh && saver.share(), one.has_mesh && h("button", { onclick: fill }, "Fill the window"),
-        one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report"),
-        h("button", { onclick: () => inspect(one) }, "Inspect in 3D")),
+        one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report")),
       h("ul", { class: "facts" }, [size(one), one.preset && presetWords(one.preset), `made in ${duration(one.progress.elapsed_s)}`,
         one.guessed !== null && one.guessed !== undefined && `${Math.round(100 * one.guessed)} % of the surface is a guess: no photo shows it`]
         .filter(Boolean).map((text) => h("li", {}, text))),

@@ -26,7 +26,6 @@ KEY, FILL, RIM = 0.6, 0.26, 0.12  # light from upper left, from all around, and 
 NEAR_TO_FAR = np.array(
     [[253, 231, 137], [94, 201, 98], [33, 145, 140], [59, 82, 139], [68, 20, 84]], float
 )  # near to far
-LINE_SHARE = 400  # half the width of the line between wiped pictures, of their width: one pixel in 400
 DARKER, SAME, BRIGHTER = (52, 119, 219), (236, 236, 236), (226, 74, 51)  # of a difference
 STRONG_DIFFERENCE = 0.2  # of full sRGB scale: shown as full colour
 
@@ -165,18 +164,3 @@ def _draw_nearest(
     nearest = depth[index] == away
     picture[index[nearest], :3] = light[inside][nearest]
     picture[index[nearest], 3] = 1.0
-
-
-def wiped(left: Picture, right: Picture, share: float) -> Picture:
-    """Draw the left picture up to a line at `share` of the width and the right one beyond, in the larger one's size."""
-    larger = max(left, right, key=lambda picture: picture.shape[1])
-    height, width = larger.shape[:2]
-    left, right = (
-        np.asarray(Image.fromarray(p).resize((width, height), Image.Resampling.BICUBIC)) for p in (left, right)
-    )
-    edge = round(np.clip(share, 0, 1) * width)
-    out = np.concatenate([left[:, :edge], right[:, edge:]], 1)
-    if 0 < edge < width:
-        thick = max(1, round(width / LINE_SHARE))
-        out[:, max(0, edge - thick) : edge + thick] = 255
-    return out

@@ -1,11 +1,11 @@
-"""The tab "Run": pause, go on, next level, stop and save, another resolution, as requests in the folder of the run."""
+"""Steering: pause, go on, next level, stop and save, another resolution, as requests in the folder of the run."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import viser
 
-from calibration.calibration import Calibration
 from reconstruct.run_folder.requests import (
     NEXT_LEVEL,
     PAUSE,
@@ -17,9 +17,8 @@ from reconstruct.run_folder.requests import (
     withdraw,
 )
 from viewer.display.run_follower import RunFollower, Status
-from viewer.widgets.legend import QUIET, remark
-from viewer.widgets.panel import PanelContext
 
+QUIET = (74, 78, 88)  # sRGB of a button that is not the main one
 AS_PLANNED = "as planned"
 SOLVING = ("hull", "solve")  # stages that can be steered; before them a request waits
 ASKED = {
@@ -38,31 +37,33 @@ HINTS = {
 }
 
 
-class RunPanel:
+class Steering:
     """Buttons that make requests, and the state of the requests. Nothing that a visitor sends becomes a file name."""
 
-    def __init__(self, context: PanelContext, tab: viser.GuiTabHandle):
-        """Lay the tab out."""
-        self._run_dir, self._follower = context.run_dir, RunFollower(context.run_dir)
-        gui = context.server.gui
-        with tab:
-            self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE, hint=HINTS[PAUSE])
-            self._go_on = gui.add_button("Go on", icon=viser.Icon.PLAYER_PLAY, visible=False)
-            self._next = gui.add_button(
-                "Finer now", icon=viser.Icon.PLAYER_TRACK_NEXT, color=QUIET, hint=HINTS[NEXT_LEVEL]
+    def __init__(self, gui: viser.GuiApi, run_dir: Path):
+        """Lay the buttons out, hidden until a run is there."""
+        self._run_dir, self._follower = run_dir, RunFollower(run_dir)
+        icons = viser.Icon
+        self._pause = gui.add_button("Pause", icon=icons.PLAYER_PAUSE, hint=HINTS[PAUSE], visible=False)
+        self._go_on = gui.add_button("Go on", icon=icons.PLAYER_PLAY, visible=False)
+        self._next, self._stop = (
+            gui.add_button(label, icon=icon, color=QUIET, hint=HINTS[name], visible=False)
+            for label, icon, name in (
+                ("Finer now", icons.PLAYER_TRACK_NEXT, NEXT_LEVEL),
+                ("Stop and save", icons.DEVICE_FLOPPY, STOP),
             )
-            self._stop = gui.add_button("Stop and save", icon=viser.Icon.DEVICE_FLOPPY, color=QUIET, hint=HINTS[STOP])
-            choices = (AS_PLANNED, *RESOLUTIONS)
-            self._resolution = gui.add_dropdown("Resolution", choices, initial_value=AS_PLANNED, hint=HINTS[AS_PLANNED])
-            self._said = gui.add_html("")
+        )
+        self._resolution = gui.add_dropdown(
+            "Resolution", (AS_PLANNED, *RESOLUTIONS), initial_value=AS_PLANNED, hint=HINTS[AS_PLANNED], visible=False
+        )
         self._pause.on_click(lambda _: self._request(PAUSE))
-        self._go_on.on_click(lambda _: withdraw(self._run_dir, PAUSE))
+        self._go_on.on_click(lambda _: withdraw(run_dir, PAUSE))
         self._next.on_click(lambda _: self._request(NEXT_LEVEL))
         self._stop.on_click(lambda _: self._request(STOP))
         self._resolution.on_update(self._choose_resolution)
 
-    def follow(self, now: Status, log: Sequence[Mapping[str, Any]], calibration: Calibration | None) -> None:
-        """Show the open requests, and the buttons that apply now."""
+    def follow(self, now: Status, log: Sequence[Mapping[str, Any]]) -> str:
+        """Show the buttons that apply now, and return what the run does about the open requests, in words."""
         asked = open_requests(self._run_dir)
         is_alive = not now.is_over
         _set_visible(self._go_on, is_alive and PAUSE in asked)
@@ -72,12 +73,7 @@ class RunPanel:
         chosen = next((name for name in RESOLUTIONS if name in asked), AS_PLANNED)
         if self._resolution.value != chosen:
             self._resolution.value = chosen
-        words = remark(_answer(now, log, asked))
-        if words != self._said.content:
-            self._said.content = words
-
-    def close(self) -> None:
-        """Nothing to end."""
+        return _answer(now, log, asked)
 
     def _request(self, name: str) -> None:
         """Ask a run that is there. A client can press buttons that its page does not show."""
@@ -94,6 +90,8 @@ class RunPanel:
 
 def _answer(now: Status, log: Sequence[Mapping[str, Any]], asked: frozenset[str]) -> str:
     """Say what the run does about the open requests."""
+    if now.is_finished:
+        return ""
     if now.is_over:
         left = " A pause that was asked for is forgotten then." if PAUSE in asked else ""
         return f"Nothing runs in this folder. The same command goes on where it stopped.{left}"
