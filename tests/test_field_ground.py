@@ -7,8 +7,6 @@ import pytest
 import torch
 from synthetic import BALL, HEAP, Box, Look, Sphere, Truth, render
 
-from calibration.ground.contact_gaps import without_gaps
-from calibration.ground.ground_shadows import find_shadows
 from calibration.ground.shadow_reach import most_height, shadow_reach
 from reconstruct.labels.field_ground_test import label_ground
 from reconstruct.labels.ground_test import test_ground as by_the_lights
@@ -55,7 +53,7 @@ def test_the_field_labels_what_the_lights_model_cannot(heap):
     scene, truth = heap
     assert by_the_lights(scene).explained < 0.5
     found = label_ground(scene)
-    assert found.field is not None
+    assert found.bare is not None
     assert overlap(found.mask.numpy() > 0.5, truth.mask) > 0.9
     assert wrong_labels(found, truth) < 0.02
     dark = (truth.visibility == 0) & ~truth.mask
@@ -66,7 +64,7 @@ def test_the_field_labels_what_the_lights_model_cannot(heap):
 def test_photos_that_the_lights_model_explains_are_labelled_by_it():
     scene, _ = render(HEAP, LOOK)
     found, usual = label_ground(scene), by_the_lights(scene)
-    assert found.field is None and usual.explained > 0.8
+    assert found.bare is None and usual.explained > 0.8
     assert torch.equal(found.visibility, usual.visibility) and torch.equal(found.mask, usual.mask)
 
 
@@ -74,18 +72,14 @@ def test_lights_that_move_leave_the_field_as_it_is(heap):
     scene, _ = heap
     first = label_ground(scene)
     moved = label_ground(replace(scene, lights=scene.lights * torch.tensor([1.02, 1.02, 1.02, 1.0])), first)
-    assert moved.field is first.field
+    assert moved.bare is first.bare
     assert torch.equal(moved.visibility, first.visibility)
 
 
 def test_ground_between_feet_is_no_object():
     scene, truth = render(ARCH, LOOK)
-    field = label_ground(spotted(scene)[0]).field
-    assert field is not None
-    shadows = find_shadows(field)
-    cut = without_gaps(field, shadows).shadows.object_mask
-    assert overlap(cut, truth.mask) >= overlap(shadows.object_mask, truth.mask)
-    assert overlap(cut, truth.mask) > 0.85
+    bare = label_ground(spotted(scene)[0]).bare
+    assert bare is not None and overlap(bare.shadows.object_mask, truth.mask) > 0.85
 
 
 def test_powers_follow_the_object_and_its_normals_with_them():
@@ -145,7 +139,7 @@ def test_where_both_ways_explain_the_table_the_powers_decide():
     known, unknown = before_a_wall(scene, 0), before_a_wall(scene, 0.12)
     assert by_the_lights(known).explained < 0.7
     by_model, by_field = label_ground(known), label_ground(unknown)
-    assert by_model.field is None and by_field.field is not None
+    assert by_model.bare is None and by_field.bare is not None
     for found in (by_model, by_field):
         assert overlap(found.mask.numpy() > 0.5, truth.mask) > 0.9
         assert wrong_labels(found, truth) < 0.02

@@ -12,7 +12,6 @@ from calibration.flashlight.outline_lights import OUTLINES_WRONG
 from calibration.ground.ground_field import GroundField, fit_ground_field
 from calibration.ground.ground_shadows import GroundShadows, find_shadows
 from calibration.ground.mirror_highlights import MirrorHighlights, find_highlights
-from calibration.ground.seams import without_seams
 from calibration.lights.ground_cells import ground_points
 from calibration.outlines.carried_light import offset_by_outlines
 from calibration.outlines.coherence import PENUMBRA, residuals, softness
@@ -300,30 +299,3 @@ def test_the_field_finds_shadows_that_a_hot_beam_and_a_tone_curve_hide(ball):
     overlap = (dark & truth).sum((1, 2)) / np.maximum((dark | truth).sum((1, 2)), 1)
     assert np.median(overlap) > 0.85
     assert (shadows.object_mask & mask).sum() > 0.8 * mask.sum()
-
-
-def test_a_walls_foot_is_cut_off_the_object_before_it_and_a_rail_of_the_object_is_not():
-    chair = np.zeros((300, 450), bool)
-    chair[120:220, 200:270] = True
-    chair[60:120, 200:206] = chair[60:120, 264:270] = True
-    chair[80:84, 200:270] = True  # a rail
-    np.testing.assert_array_equal(without_seams(chair), chair)
-    with_wall = chair.copy()
-    with_wall[61:66, :] = True
-    left = without_seams(with_wall)
-    assert not left[:, :180].any() and not left[:, 290:].any()
-    np.testing.assert_array_equal(left[70:], chair[70:])
-
-
-def test_beside_the_object_a_walls_foot_is_cut_off_too_and_a_board_that_juts_out_is_not():
-    """A figure with a slim head and a wide plinth: between head and the plinth's width the line was kept."""
-    figure = np.zeros((300, 450), bool)
-    figure[220:250, 150:300] = True
-    figure[40:220, 215:235] = True
-    with_wall = figure.copy()
-    with_wall[61:66] = True
-    with_wall[59:61, 20:440:9] = True  # a ragged edge
-    np.testing.assert_array_equal(without_seams(with_wall), figure)
-    with_board = figure.copy()
-    with_board[61:66, 160:290] = True
-    np.testing.assert_array_equal(without_seams(with_board), with_board)

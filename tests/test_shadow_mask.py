@@ -7,8 +7,8 @@ import pytest
 import torch
 from synthetic import BALL, HEAP, Look, default_camera, render
 
+from calibration.ground.min_cut import cheapest_region, parts_of
 from calibration.pose import Pose
-from calibration.side_photos.min_cut import cheapest_region, parts_of
 from capture.errors import ReconstructionError
 from reconstruct.initialization.choose_start import HullStart, choose_start
 from reconstruct.initialization.shadow_mask import with_object_mask

@@ -10,11 +10,11 @@ fitted in turn with the albedo, by iteratively reweighted least squares [Holland
 their weight sooner than brighter ones, since shadows are dark.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float16
 
 from capture.checks.robust import spread
 
@@ -29,6 +29,7 @@ WIDTHS = (0.24, 0.12, 0.06)  # of the picture's longer side: the convolution's s
 FEWEST = 0.02  # least share of the window's weight from which its mean is used in full
 FITS = 2.5  # scales: samples nearer than this follow the field
 DARKEST = 2e-3  # linear: darker samples hold noise and stray light
+DARK = -0.8  # log units: ground below is in shadow
 STEP = 3  # px between the samples that the polynomial is fitted to
 
 Maps = Float[np.ndarray, "photos height width"]
@@ -44,6 +45,7 @@ class GroundField:
     usable: Bool[np.ndarray, "photos height width"]  # neither clipped nor too dark
     follows: Float[np.ndarray, "height width"]  # share of the photos in which the pixel follows the field
     beyond: Bool[np.ndarray, "height width"] | None = None  # what is seen beyond the ground's end; None: it has none
+    colour: Float16[np.ndarray, "photos height width 2"] | None = None  # log of red and blue over green; None: grey
 
     def noise(self, of_beyond: bool = False) -> float:
         """Return one sigma of lit ground, log units, as measured on pixels that follow the field in most photos.
@@ -70,15 +72,16 @@ def fit_ground_field(
     """
     grey, usable = reduced(rgb, usable)
     usable &= grey > DARKEST
+    colour = _colours(rgb, grey)
     if beyond is None:
-        return _one_field(grey, usable)
+        return replace(_one_field(grey, usable), colour=colour)
     there = enlarged(beyond[None].astype(np.float32), *grey.shape[1:])[0] > 0.5
     near, far = _one_field(grey, usable & ~there), _one_field(grey, usable & there)
     parts = {
         name: np.where(there, getattr(far, name), getattr(near, name))
         for name in ("albedo", "light", "residual", "usable", "follows")
     }
-    return GroundField(**parts, beyond=there)
+    return GroundField(**parts, beyond=there, colour=colour)
 
 
 def _one_field(grey: Maps, usable: Bool[np.ndarray, "photos height width"]) -> GroundField:
@@ -122,6 +125,18 @@ def reduced(
     return np.stack(grey), np.stack(sure)
 
 
+def _colours(
+    rgb: Float[np.ndarray, "photos height width 3"], grey: Maps
+) -> Float16[np.ndarray, "photos small_height small_width 2"]:
+    """Return the photos' colours on the pixel grid of their grey."""
+    found = np.empty((*grey.shape, 2), np.float16)
+    for number, photo in enumerate(rgb):
+        small = cv2.resize(photo.astype(np.float32), grey.shape[:0:-1], interpolation=cv2.INTER_AREA)
+        log = np.log(np.maximum(small, DARKEST / 2))  # of a sample that is bright enough one channel may be darker
+        found[number] = log[..., [0, 2]] - log[..., [1]]
+    return found
+
+
 def at_photo_size(
     field: GroundField,
     rgb: Float[np.ndarray, "photos height width 3"],
@@ -149,7 +164,8 @@ def at_photo_size(
     follows = (flat & (np.abs(residual) < FITS * scale)).sum(0) / np.maximum(flat.sum(0), 1)
     shape = (height, width)
     follows = follows.astype(np.float32).reshape(shape)
-    return GroundField(albedo.reshape(shape), light, residual.reshape(-1, *shape), seen, follows, beyond)
+    maps = albedo.reshape(shape), light, residual.reshape(-1, *shape), seen, follows, beyond
+    return GroundField(*maps, _colours(rgb, grey))
 
 
 def enlarged(maps: Float[np.ndarray, "photos small_height small_width"], height: int, width: int) -> Maps:

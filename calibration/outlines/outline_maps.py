@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import label
 
-from calibration.ground.ground_field import GroundField
-from calibration.ground.ground_shadows import DARK, GROUND_LIKE, GroundShadows, convex_hull
+from calibration.ground.ground_field import DARK, GroundField
+from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows, convex_hull
 from calibration.ground.shadow_reach import most_height
 from calibration.lights.ground_cells import ground_points
 from calibration.outlines.metric_cues import MetricCues, ProvenSpace, proven_space

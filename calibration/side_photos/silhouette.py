@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_fill_holes, label
 
+from calibration.ground.min_cut import cheapest_region
 from calibration.posed_camera import PosedCamera
 from calibration.side_photos.ground_look import DARKEST, NARROWEST, SEEN_WIDTH, GroundLook, TripodView, ground_look
-from calibration.side_photos.min_cut import cheapest_region
 from capture.checks.robust import column_spread
 
 BESIDE_FOUND = 0.5  # of what is found in the whole region: more of the object may lie beside it

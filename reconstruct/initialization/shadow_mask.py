@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from calibration.side_photos.min_cut import cheapest_region, parts_of
+from calibration.ground.min_cut import cheapest_region, parts_of
 from capture.errors import ReconstructionError
 from reconstruct.hull.shadow_hull import HEIGHTS, box_over
 from reconstruct.initialization.vote_grid import ShadowPictures, VoteGrid, box_around, shadow_pictures

@@ -12,10 +12,8 @@ from scipy.ndimage import label, mean
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from calibration.ground.contact_gaps import LIKELY as GAP
-from calibration.ground.contact_gaps import BareGround, without_gaps
 from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
-from calibration.ground.ground_shadows import LIKELY, NEIGHBOURS, find_shadows
+from calibration.ground.ground_shadows import LIKELY, BareGround, bare_ground
 from calibration.ground.table_edges import seen_beyond
 from reconstruct.labels.ground_test import (
     GAP_CONFIDENCE,
@@ -49,7 +47,6 @@ TONE_SHARE = 0.1  # one sigma of the object's brightness under a beam and a tone
 BACKGROUND = 0.01  # of the picture: a smaller part that is no ground is a stain or a highlight
 SECTORS = 72  # of the view from the point below the camera, in which the ground ends at the nearest background
 NEAREST = 5.0  # per cent of a sector's background that may be nearer
-CLEAR = 0.3  # mean log likelihood ratio of a photo that decides for sure
 TOO_BRIGHT, MANY = 0.5, 3  # log units: a highlight; in so many photos, ground whose albedo is that of its shadow
 AMBIENT_SHARE = 0.7  # of the light in shadows on the ground: the rest comes from the lit ground and the object
 
@@ -69,8 +66,8 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
         ValueError: the scene has no photos (scene.rgb is None).
     """
     outline = None if before is None else Outline(before.mask, before.mask_confidence)
-    if before is not None and before.field is not None:
-        return _by_field(scene, before.field, without_gaps(before.field, find_shadows(before.field)), outline)
+    if before is not None and before.bare is not None:
+        return _by_field(scene, before.bare, outline)
     if is_shared(scene):
         return test_ground(split_on_ground(scene))
     if before is not None:
@@ -85,21 +82,20 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     if beyond is None and tested.explained >= EXPLAINED:
         return tested
     field = at_photo_size(fit_ground_field(rgb, usable, beyond), rgb, usable)
-    shadows = find_shadows(field)
+    bare = bare_ground(field)
     # Beyond the ground's end, too, light is smooth and shadows fall, but on no ground.
-    background = None if beyond is None else torch.from_numpy(beyond & ~shadows.object_mask)
+    background = None if beyond is None else torch.from_numpy(beyond & ~bare.shadows.object_mask)
     by_model = tested if background is None else test_ground(scene, background)
     share = float((field.follows > FOLLOWS).mean())
     if by_model.explained < EXPLAINED:
         has_more = share > tested.explained + GAINED
-        return _by_field(scene, field, without_gaps(field, shadows)) if has_more else by_model
+        return _by_field(scene, bare) if has_more else by_model
     if share < EXPLAINED:
         return by_model
-    bare = without_gaps(field, shadows)
     outline = _common_outline(scene, by_model, bare)
     if _powers_off(scene, field, by_model) < POWERS_OFF:
         return test_ground(scene, background, outline)
-    return _by_field(scene, field, bare, outline)
+    return _by_field(scene, bare, outline)
 
 
 def _powers_off(scene: Scene, field: GroundField, tested: GroundTest) -> float:
@@ -137,26 +133,26 @@ def _common_outline(scene: Scene, by_model: GroundTest, bare: BareGround) -> Out
     assert scene.rgb is not None
     by_field = bare.shadows.object_mask
     drawn = (by_model.mask > 0.5).numpy()
-    region = drawn & ((bare.gap_likelihood <= GAP) | by_field)
+    region = drawn & (~bare.types.gaps | by_field)
     if by_field.any():
         parts = np.empty(region.shape, np.int32)
-        label(region, NEIGHBOURS, output=parts)
+        label(region, np.ones((3, 3), np.uint8), output=parts)
         strange = (bare.shadows.likelihood > LIKELY) & (True if bare.field.beyond is None else ~bare.field.beyond)
-        touching = cv2.dilate(by_field.astype(np.uint8), NEIGHBOURS) > 0
+        touching = cv2.dilate(by_field.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         kept = np.asarray(mean(strange, parts, np.arange(parts.max() + 1))) > 0.5
         kept[np.unique(parts[touching])] = True
         kept[0] = False
         is_hole = (bare.shadows.likelihood <= LIKELY) & (by_model.mask_confidence > 0.5).numpy()
         found = torch.from_numpy((by_field & ~is_hole) | kept[parts])
         region = object_region(found, torch.ones_like(found)).numpy()
-    sure = _confidence(bare.shadows.likelihood - LIKELY)
+    sure = _confidence(bare.types.odds)
     added, removed = (torch.from_numpy(one) for one in (region & ~drawn, drawn & ~region))
     mask = torch.where(added | removed, coverage_at_edges(scene.rgb, torch.from_numpy(region)), by_model.mask)
     confidence = torch.where(added, sure, torch.where(removed, GAP_CONFIDENCE, by_model.mask_confidence))
     return Outline(mask, confidence)
 
 
-def _by_field(scene: Scene, field: GroundField, bare: BareGround, outline: Outline | None = None) -> GroundTest:
+def _by_field(scene: Scene, bare: BareGround, outline: Outline | None = None) -> GroundTest:
     """Return what the field of light says of the photos.
 
     Args:
@@ -164,7 +160,7 @@ def _by_field(scene: Scene, field: GroundField, bare: BareGround, outline: Outli
         outline: the object's, where it is known already.
     """
     outline = _mask(scene, bare) if outline is None else outline
-    mask = outline.mask
+    field, mask = bare.field, outline.mask
     region = mask.numpy() > 0.5
     points = ground_points(scene).double().numpy()
     visibility, confidence = _visibility(bare)
@@ -184,7 +180,7 @@ def _by_field(scene: Scene, field: GroundField, bare: BareGround, outline: Outli
         _albedo(scene, bare.field, scale, lit),
         gain,
         noise,
-        field=field,
+        bare=bare,
         ambient=_ambient(bare, region, scale),
     )
 
@@ -196,13 +192,13 @@ def _mask(scene: Scene, bare: BareGround) -> Outline:
     assert scene.rgb is not None
     found = torch.from_numpy(bare.shadows.object_mask)
     region = object_region(found, torch.ones_like(found))
-    confidence = _confidence(np.where(found, bare.gap_likelihood - GAP, bare.shadows.likelihood - LIKELY))
+    confidence = _confidence(bare.types.odds)
     return Outline(coverage_at_edges(scene.rgb, region), torch.where(found == region, confidence, GAP_CONFIDENCE))
 
 
-def _confidence(margin: Float[np.ndarray, "height width"]) -> Float[Tensor, "height width"]:
-    """Return how sure a pixel is by the margin of its mean log likelihood ratio."""
-    return torch.from_numpy(np.abs(margin) / CLEAR).float().clamp(GAP_CONFIDENCE, 1.0)
+def _confidence(odds: Float[np.ndarray, "height width"]) -> Float[Tensor, "height width"]:
+    """Return how sure a pixel is by its log odds: 0 if it may as well be either."""
+    return torch.from_numpy(np.tanh(np.abs(odds) / 2)).float().clamp(GAP_CONFIDENCE, 1.0)
 
 
 def _visibility(

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from calibration.ground.ground_field import GroundField
+from calibration.ground.ground_shadows import BareGround
 from reconstruct.labels.ground_colour import brightest_albedo, ground_around, has_other_hue
 from reconstruct.labels.level_tops import find_level_tops
 from reconstruct.labels.matting import coverage_at_edges
@@ -57,7 +57,7 @@ class GroundTest:
     noise: Noise
     background: Bool[Tensor, "height width"] | None = None  # neither object nor ground: beyond the table's edge
     explained: float = 1.0  # share of the pixels with light and ground to compare with that behave as ground
-    field: GroundField | None = None  # of light, where it made the labels instead of the lights' model
+    bare: BareGround | None = None  # what a field of light says, where it made the labels and not the lights' model
     ambient: float = 0.0  # irradiance of everything but the light, as that field's shadows show it
     keeps_outline: bool = False  # the outline was told to it, and stays as it is when the lights move
 

@@ -187,7 +187,7 @@ def with_lit_ground(
     if not scene.ground_known:
         return albedo
     where = (albedo == 0).all(-1) & (normals == 0).all(-1) & points.isfinite().all(-1)
-    for end in (ground.background, None if ground.field is None else ground.field.beyond):
+    for end in (ground.background, None if ground.bare is None else ground.bare.field.beyond):
         where &= True if end is None else ~torch.as_tensor(end)
     out, no_light = albedo.clone(), from_endless_ground(torch.zeros(len(scene.lights)))
     for pixels in _blocks(where, len(scene.lights)):

@@ -231,7 +231,7 @@ class Observer:
         self._scene = scene
         if self._first is None or not scene.ground_known:
             return
-        is_same = self._first.field is None and not is_shared(scene) and tests_alike(self._calibrated, scene)
+        is_same = self._first.bare is None and not is_shared(scene) and tests_alike(self._calibrated, scene)
         self._ground = self._first if is_same else _tested(scene, self._first)
 
     def _bounce(self, scene: Scene, points: Float[Tensor, "height width 3"]) -> Indirect:

@@ -18,8 +18,8 @@ from skimage.segmentation import random_walker
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, normalize
 
+from calibration.ground.min_cut import cheapest_region
 from calibration.ground.shadow_reach import shadow_reach
-from calibration.side_photos.min_cut import cheapest_region
 from reconstruct.scene import Scene, ground_points
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import first_hits, visibility

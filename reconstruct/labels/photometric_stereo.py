@@ -259,7 +259,7 @@ def with_free_powers(
         ground: whose field says that the lights' model does not hold.
     """
     where = (ground.mask > 0.5) & points.isfinite().all(-1)
-    if ground.field is None or not where.any():
+    if ground.bare is None or not where.any():
         return scene
     places = torch.nonzero(where)
     places = places[:: max(1, len(places) // POWER_PIXELS)]
