@@ -16,6 +16,7 @@ from dataset_folders import (
     write_shadowneus_real,
 )
 from PIL import Image
+from scipy.io import savemat
 from synthetic import BALL, Look, render
 from test_known import write_scene
 
@@ -23,7 +24,7 @@ import shadowgraph
 from calibration.lights.files import read_lights
 from calibration.scenes.distant_camera import distant_camera
 from calibration.scenes.importers import import_folder
-from capture.errors import CaptureError
+from capture.errors import CaptureError, UserError
 from reconstruct.check.verdict import read_and_check
 from reconstruct.source.calibrate_source import calibrate_source
 from reconstruct.source.options import RunOptions
@@ -198,6 +199,21 @@ def test_another_list_by_order_counts_the_photos_that_were_left_out(tmp_path, tr
     lights = calibrate_source(source, read_photos(source, options), options).first.lights
     wanted = np.delete(towards_lights(truth), 2, axis=0)
     assert np.abs(np.array([light.direction for light in lights]) - wanted).max() < 1e-3
+
+
+@pytest.mark.parametrize("is_named", [False, True], ids=["beside the photos", "by --lights"])
+@pytest.mark.parametrize("name", ["lights.csv", "lights.lp", "lights.mat"])
+def test_a_list_with_fewer_rows_than_photos_says_both_counts_and_the_remedy(tmp_path, truth, name, is_named):
+    scene = by_order(tmp_path / "scene", truth)
+    (scene / "lights.csv").unlink()
+    given = (tmp_path if is_named else scene) / name
+    rows = towards_lights(truth)[:6]
+    if given.suffix == ".mat":
+        savemat(given, {"L": rows})
+    else:
+        np.savetxt(given, rows, fmt="%.6f", delimiter="," if given.suffix == ".csv" else " ")
+    with pytest.raises(UserError, match=rf"{name} lists 6 lights for 8 photos.*Name the photos in the file"):
+        open_source(scene, RunOptions(lights=str(given)) if is_named else RunOptions())
 
 
 def test_a_list_by_order_of_a_capture_counts_all_photos(tmp_path, truth):

@@ -49,7 +49,7 @@ class ListedLights:
         Raises:
             CalibrationError: the user's file cannot be read; one that only lies there need not be of lights.
         """
-        beside = self._lists(folder)
+        beside = self.lists(folder)
         try:
             return beside[0].name if len(beside) == 1 and _photos_of(folder, beside[0]) is not None else None
         except CalibrationError:
@@ -59,11 +59,24 @@ class ListedLights:
 
     def load(self, folder: Path, split: str) -> KnownScene:
         """As load_listed."""
-        scene = load_listed(folder, self._lists(folder)[0])
+        scene = load_listed(folder, self.lists(folder)[0])
         return replace(scene, lights_from=self.given)
 
-    def _lists(self, folder: Path) -> list[Path]:
+    def lists(self, folder: Path) -> list[Path]:
+        """Return the user's file, or those of a list's usual names."""
         return [self.given] if self.given else [path for kind in KINDS for path in sorted(folder.glob(kind))]
+
+
+def why_unused(folder: Path) -> str:
+    """Return why the file of lights that lies beside photos gives no light to each; "" where none lies there."""
+    for source in ListedLights().lists(folder):
+        try:
+            load_listed(folder, source)
+        except NoMatchError as error:
+            return f" {error}"
+        except (CalibrationError, CaptureError):
+            continue  # it need not be of lights
+    return ""
 
 
 def load_listed(folder: Path, source: Path) -> KnownScene:

@@ -11,7 +11,7 @@ from calibration.known_scene import KnownScene
 from calibration.scenes.ball_scene import load_with_ball
 from calibration.scenes.ground_depth import find_ground_depth
 from calibration.scenes.importers import find_importer
-from calibration.scenes.listed_lights import load_listed
+from calibration.scenes.listed_lights import load_listed, why_unused
 from capture.errors import CaptureError, UserError
 from capture.files.names import clip_of, refuse_no_folder
 from capture.photos.finding import Finding
@@ -185,7 +185,7 @@ def _opened(folder: Path, options: RunOptions, lights: Path | None) -> Source:
         if lights is None:
             known = load_with_ball(folder, None) if options.lights == WAYS[0] else None
             if known is None:
-                raise CaptureError(f"{no_capture} {WITHOUT_BOARD}") from None
+                raise CaptureError(f"{no_capture} {WITHOUT_BOARD}{why_unused(folder)}") from None
             return Source(folder, known=known)
         try:
             known = load_listed(folder, lights)
