@@ -54,8 +54,8 @@ def loaded(folder):
 def scene_of(folder, **options):
     chosen = RunOptions(**options)
     source = open_source(folder, chosen)
-    pictures = read_photos(source, chosen)
-    calibration = calibrate_source(source, pictures, chosen)
+    (pictures,) = read_photos(source, chosen)
+    calibration = calibrate_source(source, (pictures,), chosen).first
     scene = build_scene(pictures.stack, calibration, 320, pictures.shadow, pictures.mask)
     return replace(scene, ground_known=source.ground_is_known(chosen))
 
@@ -372,7 +372,7 @@ def test_a_list_with_the_light_of_every_photo_needs_no_board(tmp_path, name, is_
     options = RunOptions(lights=str(file) if is_named else "auto")
     source = open_source(capture, options)
     assert source.known is not None and not source.ground_is_known(options)
-    calibration = calibrate_source(source, read_photos(source, options), options)
+    calibration = calibrate_source(source, read_photos(source, options), options).first
     assert [light.photo for light in calibration.lights] == names
     found = np.array([light.direction for light in calibration.lights])
     np.testing.assert_allclose(found, towards_lights(truth), atol=1e-5)
@@ -460,7 +460,7 @@ def test_a_calibration_of_another_run_brings_camera_and_ground_to_photos_without
     save_calibration(replace(truth.calibration, lights=tuple(lights)), tmp_path / "calibration.json")
     options = RunOptions(lights=str(tmp_path / "calibration.json"))
     source = open_source(capture, options)
-    calibration = calibrate_source(source, read_photos(source, options), options)
+    calibration = calibrate_source(source, read_photos(source, options), options).first
     assert source.ground_is_known(options) and calibration.unit == truth.calibration.unit
     assert calibration.camera == truth.calibration.camera
 
@@ -495,7 +495,7 @@ def test_a_file_of_lights_replaces_those_of_a_scene(tmp_path):
     (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}))
     options = RunOptions(lights=str(tmp_path / "lights.json"))
     source = open_source(tmp_path / "scene", options)
-    calibration = calibrate_source(source, read_photos(source, options), options)
+    calibration = calibrate_source(source, read_photos(source, options), options).first
     np.testing.assert_allclose(np.array([x.position for x in calibration.lights], float), moved)
     powers = np.array([light.power for light in calibration.lights])
     assert np.ptp(powers) == 0 and powers[0, 0] == pytest.approx(6.4, rel=0.5)  # 96 000 mm^2 at 0.01, albedo 0.6 as 0.9
@@ -533,9 +533,9 @@ def test_a_mask_beside_the_settings_is_the_object(tmp_path, size, split, words):
     write_grey(tmp_path / "mask.png", mask)
     source = open_source(tmp_path, RunOptions())
     assert tmp_path / "mask.png" in source.files(RunOptions())
-    assert read_photos(source, RunOptions(mask="none")).mask is None
+    assert read_photos(source, RunOptions(mask="none"))[0].mask is None
     if words is None:
-        found = read_photos(source, RunOptions()).mask
+        found = read_photos(source, RunOptions())[0].mask
         assert found is not None and np.array_equal(found, mask)
     else:
         with pytest.raises(CaptureError, match=words):
