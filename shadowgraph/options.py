@@ -130,7 +130,7 @@ class Run(Reconstruct):
 
 @dataclass(frozen=True)
 class View:
-    """Open a run in the browser: the mesh, photos, lights, and a lamp to drag."""
+    """Open a run in the browser: follow it while it goes on; light, turn, measure and save it once it is finished."""
 
     run: ResultFolder
     """The folder of a run, finished or not."""

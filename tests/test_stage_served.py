@@ -59,6 +59,23 @@ def test_notes_come_through_the_socket_into_the_run(address, run):
     (run / "stage.json").unlink()
 
 
+def test_the_result_is_saved_as_other_kinds_of_files_and_as_no_unknown_one(address):
+    page = asked(address, "/stage/")[1].decode()
+    for kind, begins in (("stl", b""), ("glb", b"glTF"), ("ply", b"ply"), ("obj", b"PK")):
+        assert f'"{kind}":[' in page
+        content = eventually(address, f"/stage/save/{kind}")
+        assert len(content) > 10_000 and content.startswith(begins)
+    for kind in ("exe", "../report.json", ""):
+        assert asked(address, f"/stage/save/{kind}")[0] == 404
+
+
+def eventually(address: str, path: str) -> bytes:
+    """What comes once it is made; until then it is a page that says so."""
+    while (content := asked(address, path)[1]).startswith(b"<!doctype html>"):
+        pass
+    return content
+
+
 def test_another_origin_may_not_write_notes(address, run):
     with pytest.raises(websockets.exceptions.InvalidStatus):
         websockets.sync.client.connect(f"ws://{address}/stage/stage.json", origin="http://evil.example")

@@ -6,6 +6,7 @@ A Host is the server, whose scene all browsers share, or one browser, which then
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -235,7 +236,8 @@ def draw_light(host: Host, index: int, light: Light, scale: PageScale) -> LightM
     return LightMarker(light, bulb, halo)
 
 
-def page_mesh(path: Path) -> Triangles:
+@lru_cache(maxsize=1)  # for all windows that look at a run; `mark` changes with the file
+def page_mesh(path: Path, mark: tuple[int, int] = (0, 0)) -> Triangles:
     """Read a finished mesh, simplified where it has more triangles than a browser shows at once.
 
     Raises:

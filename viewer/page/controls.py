@@ -65,9 +65,7 @@ class Controls:
         self._slider.on_update(lambda event: choose_photo(self.photo_index()) if event.client is not None else None)
         with gui.add_folder("Show", expand_by_default=False):
             self._layers = {n: gui.add_checkbox(n, n not in OFF_AT_FIRST, hint=LAYER_HINTS[n]) for n in LAYERS}
-            self._dark = gui.add_checkbox("Dark page", True)
-        self._dark.on_update(lambda _: self._set_theme())
-        self._set_theme()
+        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=BRAND)
         for box in self._layers.values():
             box.on_update(lambda _: self._change_layers())
         self._curve_folder = gui.add_folder("How well it fits", expand_by_default=False, visible=False)
@@ -107,11 +105,6 @@ class Controls:
         elif picture is not None and self._photo is not None:
             self._photo.image = picture
         self._caption.content = f'<div style="padding:0 .8rem .5rem;{MUTED}">{html.escape(words)}</div>'
-
-    def _set_theme(self) -> None:
-        self._gui.configure_theme(
-            dark_mode=bool(self._dark.value), show_logo=False, show_share_button=False, brand_color=BRAND
-        )
 
     def show_losses(self, seconds: np.ndarray, losses: dict[str, np.ndarray]) -> None:
         """Plot each term of the loss over seconds."""

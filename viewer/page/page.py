@@ -6,7 +6,6 @@ viewer/display/rate_limit.py limits how often it sends expensive data.
 """
 
 import threading
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from calibration.calibration import Calibration
 from capture.errors import UserError
 from reconstruct.run_folder.folder import LOG
 from reconstruct.stored_run.maps import THUMBS
-from reconstruct.stored_run.ply import Triangles, read_preview
+from reconstruct.stored_run.ply import read_preview
 from reconstruct.stored_run.stored_run import CALIBRATION, MESH
 from viewer.display.layers import (
     FIRST_FOV,
@@ -44,11 +43,6 @@ from viewer.display.run_follower import HULL, RunFollower, Status, loss_curves, 
 from viewer.page.controls import Controls
 
 REREAD_EVERY = 10  # polls, after which a folder without changes is read, because a killed run makes none
-
-
-@lru_cache(maxsize=1)  # for all windows that look at a run; `mark` changes with the file
-def _finished_mesh(path: Path, mark: tuple[int, int]) -> Triangles:
-    return page_mesh(path)
 
 
 class Page:
@@ -164,7 +158,7 @@ class Page:
         path = self.follower.path / name
         if name == MESH:
             stat = path.stat()
-            mesh = _finished_mesh(path, (stat.st_mtime_ns, stat.st_size))
+            mesh = page_mesh(path, (stat.st_mtime_ns, stat.st_size))
         else:
             mesh = read_preview(path)
         if mesh is None:

@@ -23,11 +23,10 @@ def view(
     run_dir: Path,
     host: str = "127.0.0.1",
     port: int = 8080,
-    once: bool = False,
     say: Callable[[str], object] = print,
     opens: Callable[[str], object] | None = None,
 ) -> None:
-    """Serve the page of a run folder until Ctrl-C, or, with `once`, until the run is over.
+    """Serve the page of a run folder until Ctrl-C.
 
     Args:
         run_dir: a run's folder; the run may have just begun.
@@ -53,7 +52,7 @@ def view(
         opens(f"http://localhost:{server.get_port()}/{start}" + (f"?token={server.token}" if server.token else ""))
     given_back = time.monotonic()
     try:
-        while not (once and visitors.is_over):
+        while True:
             visitors.poll()
             if time.monotonic() - given_back > GIVE_BACK_S:
                 give_memory_back()  # of data for visitors who have left

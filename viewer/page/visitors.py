@@ -8,7 +8,6 @@ from pathlib import Path
 
 import viser
 
-from viewer.display.run_follower import RunFollower, status
 from viewer.page.page import Page
 
 
@@ -19,7 +18,6 @@ class Visitors:
         """Make a page for whoever comes, and for whoever is here already."""
         self.pages: dict[int, Page] = {}  # by the number of the window's connection
         self._run_dir, self._server = run_dir, server
-        self._follower = RunFollower(run_dir)
         self._came = threading.Event()
         server.on_client_connect(lambda _: self._came.set())
 
@@ -37,8 +35,3 @@ class Visitors:
             if number not in self.pages:
                 self.pages[number] = Page(self._run_dir, client, client.camera)
             self.pages[number].poll()
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the run has ended, as far as its folder says."""
-        return status(self._follower.log(), self._follower.is_running()).is_over

@@ -1,19 +1,23 @@
 """The stage of a run as files of a server: the page, its parts beside it, and its document, which can be kept."""
 
+import tempfile
 import threading
 from dataclasses import dataclass
 from pathlib import Path
 
 from capture.errors import ReconstructionError, UserError
+from capture.files.regular import read_regular
 from capture.files.title import title_of
 from reconstruct.stored_run.stage_document import read_stage_document, save_stage_document
 from reconstruct.stored_run.stage_pack import StagePack
 from reconstruct.stored_run.stored_run import FIELDS, MESH
-from viewer.stage.pack_file import is_finished, kind_of, stage_pack, stored_stage
+from viewer.stage.pack_file import BINARY, is_finished, kind_of, stage_pack, stored_stage
 
 PAGE, DOCUMENT = ("", "index.html"), "stage.json"
 SHARED = "share.html"  # the page in one file, to send
-HTML = "text/html; charset=utf-8"
+SAVE = "save/"  # and the name of a format: the run as a file of that kind
+HTML, ZIP = "text/html; charset=utf-8", "application/zip"
+LARGEST_SAVED = 1 << 30  # bytes
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "SAMEORIGIN",  # a page of the same server may show it in a frame
@@ -49,6 +53,7 @@ class StageFiles:
         """
         self.run_dir, self._saves, self._home, self._spare = run_dir, saves, home, spare
         self._lock = threading.Lock()
+        self._saving, self._saved = threading.Lock(), (("",), StageFile(b"", HTML))  # made of what, and the newest
         self._pack: StagePack | None = None
         self._made_of: tuple[tuple[int, int], ...] = ()
 
@@ -63,6 +68,8 @@ class StageFiles:
         Raises:
             UserError: the run is not finished, or a file of it cannot be used.
         """
+        if name.startswith(SAVE) and self._saves:
+            return self._saved_as(name.removeprefix(SAVE))
         with self._lock:
             pack = self._current(makes=True)
             assert pack is not None
@@ -73,6 +80,22 @@ class StageFiles:
                 page = page_html(title_of(self.run_dir), pack, document, **({} if name == SHARED else how))
                 return StageFile(page.encode(), HTML)
             return StageFile(pack.read(name), kind_of(name)) if name in pack.names else None
+
+    def _saved_as(self, kind: str) -> StageFile | None:
+        """Return the run as a file of a format, made once for as long as run and notes are the same."""
+        from reconstruct.export.export import as_one_file, default_file, export
+        from reconstruct.export.formats import FORMATS
+
+        if kind not in FORMATS or not self.is_ready:
+            return None
+        with self._saving, tempfile.TemporaryDirectory() as folder:
+            paths = [self.run_dir / name for name in (MESH, FIELDS, DOCUMENT)]
+            made_of = (kind, *(str(path.stat().st_mtime_ns) for path in paths if path.exists()))
+            if made_of != self._saved[0]:
+                file = as_one_file(export(self.run_dir, kind, Path(folder) / default_file(self.run_dir, kind).name))
+                found = StageFile(read_regular(file, LARGEST_SAVED), ZIP if file.suffix == ".zip" else BINARY)
+                self._saved = made_of, found
+            return self._saved[1]
 
     def is_packed(self) -> bool:
         """Return whether `get` answers at once.

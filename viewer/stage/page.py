@@ -14,6 +14,7 @@ import numpy as np
 from capture.errors import ReconstructionError
 from capture.files.title import title_of
 from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, OnProgress
+from reconstruct.export.formats import FORMATS
 from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
 from reconstruct.stored_run.stage_pack import StagePack, addressed
 from reconstruct.stored_run.stored_run import StoredRun
@@ -83,11 +84,17 @@ def page_html(
         "first": html.escape(facts["addresses"]["first"]),
         "scene": _json({**facts, "name": name}),
         "document": _json(document or EMPTY),
-        "served": _json({"saves": saves, "home": home}),
+        "served": _json({"saves": saves, "home": home, **({"formats": _file_kinds()} if is_served else {})}),
         "shaders": "\n".join(f'<script type="text/plain" id="{name}">{_shader(name)}</script>' for name in SHADERS),
         "script": script,
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda found: values[found.group(1)], _asset("stage.html"))
+
+
+def _file_kinds() -> dict[str, tuple[str, str]]:
+    """Return title and suffix of each format that a served page offers: videos take minutes and are the command's."""
+    rows = FORMATS.items()
+    return {name: (row.title, row.suffix) for name, row in rows if "frames" not in row.takes and name != "html"}
 
 
 def page_policy(is_served: bool) -> str:

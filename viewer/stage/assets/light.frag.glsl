@@ -215,6 +215,9 @@ void main() {
       colour = vec3(0.42 + 0.42 * k / (1.0 + abs(k))) * (0.55 + 0.45 * facing * lit);
     }
 #endif
+#if LOOK == 7
+    colour = albedo;
+#endif
 #if LOOK == 4
     if (isObject) colour = pow(0.5 + 0.5 * vec3(dot(n, right), -dot(n, down), -dot(n, forward)), vec3(2.2));
 #endif

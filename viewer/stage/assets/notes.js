@@ -116,6 +116,18 @@ export async function sharePage() {
   download(`${facts.name}.html`, new Blob([`<!doctype html>\n${copy.outerHTML}`], { type: "text/html" }));
 }
 
+// The result as another kind of file, which the server makes; until it is there, a page comes that says so.
+export async function saveFile(kind) {
+  const [title, suffix] = served.formats[kind];
+  let answer = null;
+  say(`Being made: ${title} ...`);
+  do answer = await fetch(`save/${kind}`).catch(() => null); while (answer?.headers.get("Content-Type").startsWith("text/html"));
+  say(answer?.ok ? "" : answer ? await answer.text() : "The file could not be made: the server does not answer. Is it still running?");
+  if (!answer?.ok) return;
+  const file = await answer.blob();
+  download(`${facts.name}${file.type === "application/zip" ? ".zip" : suffix}`, file);
+}
+
 export const saveNotes = () => download("stage.json", new Blob([JSON.stringify(stage, null, 1)], { type: "application/json" }));
 
 export async function savePicture(redraw) {

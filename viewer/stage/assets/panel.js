@@ -3,7 +3,7 @@ import { byId, facts, served } from "./scene.js";
 import {
   canRedo, canUndo, editStage, lamp, lampFromAbove, lampTo, putLamp, redo, savedSentence, setLamp, setShown, setView, shown, stage, undo,
 } from "./state.js";
-import { recallView, removeNote, removeView, saveNotes, savePicture, saveView, sharePage, startTool } from "./notes.js";
+import { recallView, removeNote, removeView, saveFile, saveNotes, savePicture, saveView, sharePage, startTool } from "./notes.js";
 import { showPhoto } from "./renderer.js";
 
 const RAKING = 8 * Math.PI / 180;
@@ -14,7 +14,7 @@ const unit_ = facts.unit === "mm" ? "mm" : "units";
 const on = (id, event, act) => byId(id).addEventListener(event, act);
 const KEYS = [
   ["Arrows", "move the lamp"], ["Shift and arrows", "turn the view"], ["Ctrl and arrows", "shift the picture"], ["+ and -", "zoom"],
-  ["Home or 0", "back to the first view and lamp"], ["L", "the light follows the mouse, or stays"], ["1 to 7", "what is shown: 6 is what is known"],
+  ["Home or 0", "back to the first view and lamp"], ["L", "the light follows the mouse, or stays"], ["1 to 8", "what is shown: 6 is what is known"],
   ["Ctrl Z, Ctrl Shift Z", "undo, redo"], ["Enter, Escape", "place a note at the cross, end it"], ["?", "this list"],
 ];
 const ABOUT = [
@@ -46,6 +46,9 @@ export function usePanel(redraw) {
   on("share", "click", sharePage);
   on("list-keys", "click", listKeys);
   on("save-notes", "click", saveNotes);
+  for (const [kind, [title]] of Object.entries(served.formats || {})) byId("save-kind").append(new Option(title, kind));
+  byId("save-row").hidden = !served.formats;
+  on("save-file", "click", () => saveFile(byId("save-kind").value));
   on("menu", "click", () => openPanel(byId("panel").hidden));
   cropRows();
   showStage();

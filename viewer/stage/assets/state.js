@@ -2,7 +2,7 @@
 import { add, clamp, onSphere, axesTowards, dot } from "./vectors.js";
 import { byId, facts, groundPlace, served, toPage } from "./scene.js";
 
-export const LOOKS = ["photo", "specular", "unsharp", "curvature", "normals", "known", "clay"];
+export const LOOKS = ["photo", "specular", "unsharp", "curvature", "normals", "known", "clay", "albedo"];
 export const LOW = 0.03, HIGH = 0.998;        // radius of the lamp's place in the dome seen from above
 // Elevation of the view, rad. Of an object that was laid anew the underside was photographed, too: it is seen from below.
 export const HIGHEST = 1.5, LOWEST = facts.isWhole ? -HIGHEST : 0.06;
