@@ -19,10 +19,12 @@ from calibration.flashlight.light_estimate import LightFit, locate_lights
 from calibration.flashlight.phone import MIN_VIEWS, PhoneViews, locate_lights_from_phone
 from calibration.flashlight.solids import fuse_shadow_lights, locate_sun
 from calibration.light import Light
+from calibration.lights.mixed_light import SECOND_LIGHT, MixedLight, mixture_of
 from calibration.outlines.metric_cues import MetricCues
 from calibration.posed_camera import PosedCamera
 from calibration.reframed import reframed, with_doubt
 from calibration.side_photos.side_views import metric_cues, side_notes
+from capture.checks.ambient_light import find_shadows
 from capture.errors import CalibrationError
 from capture.files.names import clip_of
 from capture.photos.finding import Finding, grouped
@@ -67,13 +69,14 @@ def calibrate(
             f"{session.folder}: session.toml declares {declared.lights_at_once} lights at once, which the ground's "
             "shading cannot separate; their positions are needed. Give a file with a line for each: --lights FILE."
         )
+    mixtures: list[str] = []
     if declared.light_kind == "sun":
-        fit, notes = (
-            locate_sun(stack, posed_camera, usable, declared.solids),
-            ["lights: from the shadows of declared objects"],
-        )
+        fit = locate_sun(stack, posed_camera, usable, declared.solids)
+        notes = ["lights: from the shadows of declared objects"]
     else:
-        fit, notes = _lights(session, stack, posed_camera, usable, board, lights, cues)
+        fit, notes, spoilt, mixtures = _unmixed(session, stack, posed_camera, usable, board, lights, cues)
+        usable = usable & ~spoilt
+        dropped |= {path.name: SECOND_LIGHT for path, one in zip(stack.paths, spoilt, strict=True) if one}
         if declared.solids:
             fit, more = fuse_shadow_lights(fit, stack, posed_camera, declared.solids)
             notes = [*notes, *more]
@@ -86,7 +89,8 @@ def calibrate(
     notes = [*session.notes, *residuals.get("notes", []), *framing_notes, *notes, *side_notes(sides)]
     wider = doubt.of_ground(posed_camera, residuals)
     rows = {"side_photos": [side.row() for side in sides], "left_out_photos": [one.row() for one in session.left_out]}
-    residuals = residuals | fit.residuals | wider | {"notes": notes} | rows
+    rows |= {"notes": notes, "warnings": [*residuals.get("warnings", []), *mixtures]}
+    residuals = residuals | fit.residuals | wider | rows
     shared = {"beam": fit.beam, "ambient": fit.ambient, "residuals": residuals, "side_views": cues.views}
     return Calibration.of(posed_camera, every, **shared)
 
@@ -126,6 +130,36 @@ def left_out(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[dict[str, 
             f"be used, {MIN_PHOTOS} needed (25 or more are better). {grouped(faults)}. Take these photos again."
         )
     return {name: f"{one.kind}: {one.text}" for name, one in dropped.items()}, usable
+
+
+def _unmixed(
+    session: Session,
+    stack: PhotoStack,
+    posed_camera: PosedCamera,
+    usable: Bool[np.ndarray, " photos"],
+    board: AnyBoard,
+    lights: str,
+    cues: MetricCues,
+) -> tuple[LightFit, list[str], Bool[np.ndarray, " photos"], list[str]]:
+    """Return the lights, notes, which usable photos a second light spoilt, and what is said of light that is mixed.
+
+    Without the spoilt photos lights are looked for once more, and never again: trouble at most doubles the work.
+    """
+    fit, notes = _lights(session, stack, posed_camera, usable, board, lights, cues)
+    mixed, spoilt = _mixture(fit, stack, usable), np.zeros_like(usable)
+    if mixed is None:
+        return fit, notes, spoilt, []
+    said = [mixed.sentence([light.photo for light in fit.lights])]
+    spoilt[usable] = mixed.spoilt()
+    if not spoilt.any() or (usable & ~spoilt).sum() < MIN_PHOTOS:
+        return fit, notes, np.zeros_like(usable), said
+    return *_lights(session, stack, posed_camera, usable & ~spoilt, board, lights, cues), spoilt, said
+
+
+def _mixture(fit: LightFit, stack: PhotoStack, usable: Bool[np.ndarray, " photos"]) -> MixedLight | None:
+    """Return the two groups of photos that the fit of the usable ones tells, if there are two."""
+    misfit = fit.residuals.get("relative_misfit_by_photo", {})
+    return mixture_of(fit.lights, misfit, find_shadows(stack, usable.tolist()).of(usable))
 
 
 def _lights(

@@ -14,6 +14,7 @@ from calibration.ground.table_edges import TableEdge, on_table
 from calibration.lights import hand
 from calibration.lights.ground_cells import GroundCells, sample_ground
 from calibration.posed_camera import PosedCamera
+from capture.checks.mixture import STEADY, levels
 from capture.checks.robust import spread
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
@@ -186,9 +187,10 @@ def fit_flashlights(start: Flashlights, evidence: Evidence, tangent: Tangent) ->
     flashlights, weight = refine(start, evidence, LOOSE_POWER, tangent, FAR + NEAR)
     evidence = less_near_object(evidence, weight)
     flashlights, _ = refine(flashlights, evidence, LOOSE_POWER, tangent, NEAR + LAST)
-    seen = spread(flashlights.log_power - np.median(flashlights.log_power))
+    usual = levels(flashlights.log_power, STEADY)
+    seen = spread(flashlights.log_power - usual)
     varies = POWER_SHARE * np.sqrt(max(seen**2 - POWER_ERROR**2, 0.0))
-    priors = Priors(log_power=float(np.clip(varies, STEADY_POWER, LOOSE_POWER.log_power)))
+    priors = Priors(log_power=float(np.clip(varies, STEADY_POWER, LOOSE_POWER.log_power)), usual=usual)
     flashlights, weight = refine(flashlights, evidence, priors, tangent, NEAR + LAST)
     ground = int((weight.sum(0) > 0).sum())
     if ground < MIN_GROUND:

@@ -94,6 +94,7 @@ class Priors:
     ring: float = 20.0  # splines
     ambient: float = 0.2  # of a flashlight at a hand's usual distance
     power_outlier: float = 0.1  # a photo this far (log) from the common power is another exposure: Geman-McClure
+    usual: Float[np.ndarray, " photos"] | float = 0.0  # log power that a photo shares with those of its group
     oval: float = 0.02  # a beam without any such misfit keeps its accuracy (0.05 to 0.06 % in simulations)
 
 
@@ -231,7 +232,8 @@ def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
         for x in range(3):
             jac[offset + rows, own * rows + 3 + x] = basis[:, x] / width
             jac[offset + rows, full - 3 + x] = -basis[:, x] / width
-    bent = 1 + (flashlights.log_power / priors.power_outlier) ** 2
+    own_power = flashlights.log_power - priors.usual
+    bent = 1 + (own_power / priors.power_outlier) ** 2
     jac[2 * n + rows, own * rows + 6] = bent**-1.5 / priors.log_power
     rest = np.arange(own * n, full)
     widths = np.r_[
@@ -247,7 +249,7 @@ def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
     value = np.r_[
         (miss * first).sum(1) / width,
         (miss * second).sum(1) / width,
-        flashlights.log_power / bent**0.5 / priors.log_power,
+        own_power / bent**0.5 / priors.log_power,
         np.r_[flashlights.beam, flashlights.ambient, flashlights.aim - evidence.cells.centre] / widths,
         oval,
     ]

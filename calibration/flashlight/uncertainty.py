@@ -26,6 +26,7 @@ from calibration.flashlight.beam_profile import RING_TERMS
 from calibration.flashlight.descent import refine
 from calibration.flashlight.fit import FAR, LAST, NEAR, OVAL_PHOTOS, FlashlightFit
 from calibration.flashlight.model import NOISE, normal_equations
+from capture.checks.mixture import STEADY, levels
 from capture.checks.robust import spread
 
 QUADRANTS = 4
@@ -64,7 +65,7 @@ def _between_quadrants(fit: FlashlightFit) -> Float[np.ndarray, "photos 3"]:
 def unseen_error(fit: FlashlightFit) -> Float[np.ndarray, " photos"]:
     """Return the position error (world unit) that no residual of positions from shading alone shows."""
     reach = np.linalg.norm(fit.flashlights.positions - fit.evidence.cells.centre, axis=1)
-    own = fit.flashlights.log_power - np.median(fit.flashlights.log_power)
+    own = fit.flashlights.log_power - levels(fit.flashlights.log_power, STEADY)
     by_power = 0.5 * np.hypot(np.minimum(np.abs(own), fit.priors.power_outlier), spread(own))
     return np.hypot(HONEST_SHARE if len(reach) >= OVAL_PHOTOS else FEW_SHARE, by_power) * reach
 

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from capture.checks.mixture import levels, usual_level
 from capture.checks.robust import spread
 from capture.photos.channels import mean_of_channels
 from capture.photos.finding import Finding
@@ -36,8 +37,7 @@ FEWEST_TO_COMPARE = 8  # of fewer, the median lies in shadow in places, and few 
 CLEAR_IN = 0.5  # of the photos, from which on the darkest parts are shadows, and tell of the room
 FEWEST_PIXELS = 20  # that a photo's shadow has to share with those of others
 ROOM_LIGHT = 0.05  # in all photos, as docs/report.md has it; rooms that are dark enough gave 2.2 to 4.3 %
-MORE_LIGHT, LESS_LIGHT = 0.01, 0.006  # in one photo, than in the others: good ones had 0.009 more or 0.003 less at most
-APART_SIGMAS = 5.0  # of how much photos differ: so far as well
+ALIKE = 0.0008  # mean deviation of the light in the shadows of good photos: 0.1 % of the usual light is one sigma
 SPOILT = 0.05  # above the others: shading and shadows of such a photo mislead
 VOTES = 6  # of the robust fit
 CUT = 2.0  # sigmas at which a pixel counts half (Cauchy)
@@ -52,6 +52,10 @@ class Shadows:
     ratios: Ratios
     levels: Float[np.ndarray, " photos"]  # of the darkest part; NaN where no shadow is clear
     inside: Bool[np.ndarray, "photos pixels"]
+
+    def of(self, photos: Bool[np.ndarray, " photos"]) -> "Shadows":
+        """Return those of some photos."""
+        return Shadows(self.ratios[photos], self.levels[photos], self.inside[photos])
 
 
 def find_shadows(stack: PhotoStack, good: Sequence[bool], dark: PhotoStack | None = None) -> Shadows:
@@ -84,12 +88,12 @@ def _small(stack: PhotoStack) -> Float[np.ndarray, "photos rows columns"]:
     return np.stack([mean_of_channels(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)) for rgb in stack.rgb])
 
 
-def excess(shadows: Shadows, among: Bool[np.ndarray, " photos"]) -> Float[np.ndarray, " photos"]:
+def excess(shadows: Shadows) -> Float[np.ndarray, " photos"]:
     """Return by how much each photo's shadows are brighter than others at the same places; NaN without an estimate.
 
     ratio[k, x] = place[x] + excess[k], by least squares with robust weights; median excess 0.
     """
-    asked = shadows.inside & (among & np.isfinite(shadows.levels))[:, None]
+    asked = shadows.inside & np.isfinite(shadows.levels)[:, None]
     shared = asked.sum(0) >= 2
     asked, ratios = asked[:, shared], shadows.ratios[:, shared]
     known = asked.sum(1) >= FEWEST_PIXELS
@@ -110,31 +114,35 @@ def excess(shadows: Shadows, among: Bool[np.ndarray, " photos"]) -> Float[np.nda
     return more
 
 
-def _apart(shadows: Shadows) -> dict[int, tuple[float, float]]:
-    """Photos with more or less light in their shadows than the others: the difference and its limit, worst first."""
-    among, found = np.ones(len(shadows.levels), bool), {}
-    while True:
-        more = excess(shadows, among)
-        if np.isfinite(more).sum() < FEWEST_TO_COMPARE:
-            return found
-        sigma = spread(more)
-        limits = np.maximum(np.where(more > 0, MORE_LIGHT, LESS_LIGHT), APART_SIGMAS * sigma)
-        worst = int(np.nanargmax(np.abs(more) / limits))
-        if not abs(more[worst]) > limits[worst]:
-            return found
-        found[worst] = float(more[worst]), float(limits[worst])
-        among[worst] = False
+def _apart(shadows: Shadows) -> dict[int, float]:
+    """Photos with more or less light in their shadows than those that are right, and by how much.
+
+    The largest group is right. A smaller one with less is right instead, if its photos are not darker all over by as
+    much: these were not exposed less, but the others had the room light on.
+    """
+    more = excess(shadows)
+    if np.isfinite(more).sum() < FEWEST_TO_COMPARE:
+        return {}
+    own = levels(more, ALIKE)
+    right, room = usual_level(own), float(np.nanmedian(shadows.levels))
+    bright = np.log(np.maximum(np.median(shadows.ratios, axis=1), DIM))
+    for lower in np.unique(own[own < right]):
+        less = np.log(max(room + lower, ALIKE) / max(room + right, ALIKE))
+        dimmed = np.median(bright[own == lower]) - np.median(bright[own == right])
+        if abs(dimmed) < abs(dimmed - less) and (own == lower).sum() >= FEWEST_PHOTOS:
+            right = float(lower)
+            break
+    return {int(k): float(more[k] - right) for k in np.flatnonzero(np.isfinite(own) & (own != right))}
 
 
-def _apart_finding(path: Path, more: float, limit: float) -> Finding:
+def _apart_finding(path: Path, more: float) -> Finding:
     """Return the finding for a photo whose shadows differ from those of the others."""
-    than = "of the usual light {} than other photos have at the same places"
+    than = f"shadows have {abs(more):.1%} of the usual light {'more' if more > 0 else 'less'} than other photos have "
+    than += "at the same places: "
     if more > 0:
-        text = f"shadows have {more:.1%} {than.format('more')}, at most {limit:.1%} is fine: was a lamp or a door open?"
-        return Finding(path, "ambient light", text, more, limit, more > SPOILT)
-    text = f"shadows have {-more:.1%} {than.format('less')}, at most {limit:.1%} is fine: exposed less, "
-    text += "which the file does not "
-    return Finding(path, "exposure changed", f"{text}tell? Lock the exposure next time", more, limit, False)
+        return Finding(path, "ambient light", f"{than}was a lamp or a door open?", more, SPOILT, more > SPOILT)
+    text = f"{than}exposed less, which the file does not tell? Lock the exposure next time"
+    return Finding(path, "exposure changed", text, more, SPOILT, False)
 
 
 def shadow_findings(stack: PhotoStack, good: Sequence[bool], dark: PhotoStack | None = None) -> list[Finding]:
@@ -153,7 +161,7 @@ def shadow_findings(stack: PhotoStack, good: Sequence[bool], dark: PhotoStack | 
     found = []
     for k, (path, level) in enumerate(zip(stack.paths, shadows.levels.tolist(), strict=True)):
         if k in apart:
-            found.append(_apart_finding(path, *apart[k]))
+            found.append(_apart_finding(path, apart[k]))
         elif everywhere and good[k]:
             own = np.isfinite(level)
             text = f"shadows{'' if own else ' of the other photos'} have {level if own else middle:.1%} of the usual "

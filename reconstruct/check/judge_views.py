@@ -63,11 +63,11 @@ def _judge_places(
 def _facts_together(views: CalibratedViews, parts: Sequence[Readiness]) -> dict[str, Any]:
     """Return the facts of all views: counts added up, shares of the worst view, and those of each view by its name."""
     facts = dict(parts[0].facts)
-    for name in ("photos", "photos_used", "powers_off", "photos_with_shadow", "shadows_cut"):
+    for name in ("photos", "photos_used", "photos_with_shadow", "shadows_cut"):
         facts[name] = sum(part.facts[name] for part in parts)
     for name in ("ground_share", "ring_share", "object_share", "lowest_light_deg"):
         facts[name] = min(part.facts[name] for part in parts)
-    for name in ("highest_light_deg", "light_sigma_share", "largest_power_change", "object_cut"):
+    for name in ("highest_light_deg", "light_sigma_share", "object_cut"):
         facts[name] = max(part.facts[name] for part in parts)
     kinds: Counter[str] = Counter()
     for part in parts:

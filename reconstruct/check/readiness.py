@@ -24,8 +24,6 @@ PLENTY = 25  # photos from which more add little
 WIDE_GAP, HALF = np.radians(90.0), np.radians(180.0)  # of the horizon without light: shape is mostly guessed
 LOW, HIGH = np.radians(20.0), np.radians(60.0)  # shadows longer than 2.7 heights leave the picture, short ones hide
 FEW_BANDS = 0.15  # of the photos that should be lower than HIGH, and higher than the middle of both
-POWER_CHANGED = 0.1  # log: flashlights keep their power within 3 %, so a larger change comes from the exposure
-LEAST_POWER = 1e-12  # replaces a power of zero, which has no logarithm
 LARGE_SIGMA = 0.03  # of a light's distance: more is refined with the surface, but costs shape
 MANY_DROPPED, MANY_CUT = 0.25, 0.4  # of the photos
 LITTLE_GROUND, LITTLE_RING = 0.15, 0.5  # of the picture, of the ground near the object
@@ -62,19 +60,6 @@ class Readiness:
 def powers_mean_nothing(calibration: Calibration) -> bool:
     """Return whether given lights miss the ground's shading: a power then makes up for beam and tone curve."""
     return float(calibration.residuals.get("given_lights_misfit", 0.0)) >= SHADING_MISFIT
-
-
-def usual_log(values: Sequence[float] | Float[np.ndarray, " values"]) -> float:
-    """Return the middle of the largest group of values that differ by at most POWER_CHANGED; ties: the narrowest group.
-
-    The median is not used: with a second large group, as after a step of exposure, it lies at the rim of a group, and
-    it lies between the groups if none holds half of the values.
-    """
-    ordered = np.sort(values)
-    ends = np.searchsorted(ordered, ordered + POWER_CHANGED, side="right")
-    sizes, widths = ends - np.arange(len(ordered)), ordered[ends - 1] - ordered
-    first = int(np.lexsort((widths, -sizes))[0])
-    return float(np.median(ordered[first : ends[first]]))
 
 
 @dataclass
@@ -141,8 +126,6 @@ def capture_facts(calibration: Calibration, findings: Sequence[Finding], cover: 
     reach = [1.0 if x.position is None else float(np.linalg.norm(x.position - cover.centre)) for x in used]
     sigma = [float(np.linalg.norm(light.sigma)) / distance for light, distance in zip(used, reach, strict=True)]
     kinds = Counter(finding.kind for finding in findings)
-    power = np.log([max(float(light.power.mean()), LEAST_POWER) for light in used] or [1.0])
-    off = np.zeros_like(power) if powers_mean_nothing(calibration) else np.abs(power - usual_log(power))
     return {
         "photos": len({light.photo for light in calibration.lights} | _left_out(findings)),
         "photos_used": len({light.photo for light in used}),
@@ -152,8 +135,6 @@ def capture_facts(calibration: Calibration, findings: Sequence[Finding], cover: 
         "share_below_60_deg": float((elevation < np.degrees(HIGH)).mean()) if len(ways) else 0.0,
         "share_above_40_deg": float((elevation > np.degrees(0.5 * (LOW + HIGH))).mean()) if len(ways) else 0.0,
         "light_sigma_share": float(np.median(sigma)) if sigma else 0.0,
-        "powers_off": int((off > POWER_CHANGED).sum()),
-        "largest_power_change": float(off.max()),
         "object_share": cover.object_share,
         "object_cut": cover.is_cut,
         "ground_share": cover.ground_share,
@@ -245,10 +226,6 @@ def _judge_lights(say: Judge, facts: dict[str, Any]) -> None:
         say("fair", "nearly all lights are high above the object", "Hold the flashlight lower, for longer shadows.")
     if facts["share_above_40_deg"] < FEW_BANDS:
         say("fair", "nearly all lights are low", "Shoot some photos with the flashlight high above the object.")
-    if facts["powers_off"]:
-        reason = f"{facts['powers_off']} photos are brighter or darker than the flashlight's place explains, by up to "
-        reason += f"{np.expm1(facts['largest_power_change']):.0%}; each has been given a power of its own"
-        say("fair", reason, "")
     if facts["light_sigma_share"] > LARGE_SIGMA:
         say(
             "fair",

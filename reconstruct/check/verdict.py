@@ -12,7 +12,7 @@ import numpy as np
 
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
-from calibration.light import Light
+from capture.checks.mixture import STEADY, levels, usual_level
 from capture.errors import CalibrationError, CaptureError
 from capture.files.title import title_of
 from capture.photos.finding import Finding
@@ -20,7 +20,7 @@ from capture.photos.photo import PhotoStack
 from capture.session.session import FEWEST_LIT
 from reconstruct.check.judge_views import judge_together
 from reconstruct.check.light_coverage import LONG_SIDE, ShadowCover, directions, from_the_camera, shadow_cover
-from reconstruct.check.readiness import POWER_CHANGED, Readiness, judge, powers_mean_nothing, usual_log
+from reconstruct.check.readiness import Readiness, judge, powers_mean_nothing
 from reconstruct.check.without_ground import judge_without_ground
 from reconstruct.scene import build_scene
 from reconstruct.source.calibrate_source import calibrate_source
@@ -28,7 +28,6 @@ from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import Photos, read_photos
 from reconstruct.source.source import Source
 
-POWER_SIGMAS = 2.0  # standard deviations of a power whose light's distance is uncertain
 ALL_LIT = 0.75  # of the photos with room light in their shadows: a changed exposure of some cannot cause it
 REASONS_SHOWN = 3
 
@@ -135,40 +134,28 @@ def _check_view(source: Source, photos: Photos, calibration: Calibration, is_par
 
 
 def with_power_changes(findings: Sequence[Finding], calibration: Calibration, stack: PhotoStack) -> tuple[Finding, ...]:
-    """Add a finding for each photo whose light's power differs from the others' by more than a lamp varies.
+    """Add a finding for each photo whose light is used, and has another power than those of the largest group.
 
-    Such a photo had another exposure that its file does not state. This also scales its shadows, so findings on its
-    shadows are dropped, unless nearly all photos show room light. For an unused light, only a difference larger than
-    the uncertainty of its distance explains counts. Where given lights miss the ground's shading, powers mean nothing.
+    Such a photo had another exposure that its file does not state, or the flashlight faded. This also scales its
+    shadows, so findings on its shadows are dropped, unless nearly all photos show room light. Where given lights miss
+    the ground's shading, powers mean nothing.
     """
-    if powers_mean_nothing(calibration):
+    known = {light.photo: float(light.power.mean()) for light in calibration.lights if light.used}
+    known = {name: float(np.log(power)) for name, power in known.items() if power > 0}
+    if powers_mean_nothing(calibration) or not known:
         return tuple(findings)
-    known = [light for light in calibration.lights if light.power.mean() > 0]
-    powers = {light.photo: float(np.log(light.power.mean())) for light in known}
-    allowed = {light.photo for light in known if light.used}
-    if not allowed:
-        return tuple(findings)
-    usual = usual_log([powers[name] for name in sorted(allowed)])
-    doubt = {light.photo: _power_doubt(light, calibration) for light in known}
+    own = levels(np.array(list(known.values())), STEADY)
+    usual, level = usual_level(own), dict(zip(known, own, strict=True))
     changed = []
     for path in stack.paths:
-        ratio = float(np.exp(powers.get(path.name, usual) - usual))
-        if abs(np.log(ratio)) > POWER_CHANGED + doubt.get(path.name, 0.0):
-            text = f"{ratio:.2f} times as bright as the flashlight's place explains: exposed otherwise, which the file "
-            text += f"does not tell, or another lamp; {'allowed for' if path.name in allowed else 'not used'}"
-            changed.append(Finding(path, "exposure changed", text, ratio, float(np.exp(POWER_CHANGED)), False))
+        if level.get(path.name, usual) != usual:
+            ratio = float(np.exp(known[path.name] - usual))
+            text = f"{ratio:.2f} times as bright as the flashlight's place explains; used with a power of its own"
+            changed.append(Finding(path, "exposure changed", text, ratio, 1.0, False))
     names = {finding.photo for finding in changed}
     is_room = sum(one.kind == "ambient light" for one in findings) > ALL_LIT * len(stack.paths)
     kept = [one for one in findings if is_room or one.drop or one.kind != "ambient light" or one.photo not in names]
     return (*kept, *changed)
-
-
-def _power_doubt(light: Light, calibration: Calibration) -> float:
-    """Return the uncertainty of the logarithm of an unused light's power, which grows as the square of its distance."""
-    if light.used or light.position is None:
-        return 0.0
-    distance = float(np.linalg.norm(light.position - calibration.posed_camera.looked_at()))
-    return 2 * POWER_SIGMAS * float(np.linalg.norm(light.sigma)) / distance
 
 
 def tone_doubts(calibration: Calibration) -> tuple[str, ...]:

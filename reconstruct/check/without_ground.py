@@ -15,7 +15,6 @@ from reconstruct.check.light_coverage import ShadowCover, directions
 from reconstruct.check.readiness import (
     GRADES,
     MORE_LIGHTS,
-    POWER_CHANGED,
     Judge,
     Readiness,
     capture_facts,
@@ -31,6 +30,7 @@ FLAT = 0.15  # rms of the lights' directions off their plane: below, normals acr
 DARK, MANY_DARK = 0.004, 0.25  # linear value that noise rules, and the share of the object's samples that may lie below
 CLIPPED = 0.02  # of the object's samples that may be clipped
 GLOSSY = 0.08  # reflectance at normal incidence: twice that of plastic; interreflections then count
+POWER_CHANGED = 0.1  # log: lists of intensities are right within a few per cent
 NAMED = 4  # photos in a sentence
 
 

@@ -1,0 +1,118 @@
+"""Light that is mixed: two groups of photos are told by their own test, with its cause, and the work stays bounded."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import lit_table
+import numpy as np
+import pytest
+from flashlight_photos import POSED_CAMERA, Recipe, handheld_lights, photograph
+
+import calibration.calibrate as glue
+from calibration.flashlight.fit import collect, first_guess, fit_flashlights, photo_quality
+from calibration.flashlight.light_estimate import LightFit
+from calibration.flashlight.model import free_tangent
+from calibration.lights.mixed_light import MixedLight, PhotoLight, find_mixture
+from capture.checks.ambient_light import find_shadows
+from capture.checks.check_stack import check_stack
+from capture.checks.mixture import STEADY, levels, second_group
+from capture.session.session import Session, SessionSettings
+
+N = 18
+ARRANGEMENTS = {"first half": range(9), "every other": range(1, 18, 2), "every third": range(0, 18, 3)}
+
+
+@pytest.fixture(scope="module")
+def lights():
+    return handheld_lights(N, np.random.default_rng(4))
+
+
+def numbers(stack) -> PhotoLight:
+    """What the ground's shading and the shadows say of each photo."""
+    evidence, _ = collect(stack, POSED_CAMERA, np.ones(N, bool))
+    fit = fit_flashlights(first_guess(evidence), evidence, free_tangent)
+    return PhotoLight.of(find_shadows(stack, [True] * N), fit.flashlights.log_power, photo_quality(fit)[0])
+
+
+def of_power(lights, ratio, photos):
+    return tuple(replace(x, power=x.power * (ratio if k in photos else 1)) for k, x in enumerate(lights))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_ordinary_photos_are_one_group(seed):
+    assert find_mixture(numbers(photograph(Recipe(n_photos=N), seed).stack)) is None
+
+
+@pytest.mark.parametrize(("ratio", "first"), [(0.55, 7), (0.75, 9), (1.6, 12)])
+def test_a_flashlight_that_changes_its_power_is_told_from_which_photo_on(lights, ratio, first):
+    stack = photograph(Recipe(lights=of_power(of_power(lights, 0.5, range(N)), ratio, range(first, N)))).stack
+    found = find_mixture(numbers(stack))
+    assert found is not None and found.cause == "power" and not found.spoilt().any()
+    names = [path.name for path in stack.paths]
+    told = found.ratio if found.groups[-1] else 1 / found.ratio
+    assert told == pytest.approx(ratio, rel=0.06)
+    assert found.sentence(names).startswith(f"from {names[first]} on the light is {told:.2g} times as bright as ")
+
+
+@pytest.mark.parametrize("where", ARRANGEMENTS)
+def test_two_flashlights_at_once_are_told_by_the_names_of_their_photos(lights, where):
+    stack = photograph(Recipe(lights=of_power(lights, 0.5, range(N)))).stack
+    other = photograph(Recipe(lights=of_power((*lights[5:], *lights[:5]), 0.5, range(N)))).stack
+    both = np.isin(np.arange(N), ARRANGEMENTS[where])
+    found = find_mixture(numbers(replace(stack, rgb=stack.rgb + other.rgb * both[:, None, None, None])))
+    assert found is not None and found.cause == "second light"
+    assert (found.spoilt() == both).mean() > 0.9 and found.spoilt()[both].all()
+
+
+@pytest.mark.parametrize("photos", [range(9), range(0, 18, 2), range(12)], ids=str)
+def test_room_light_in_half_of_the_photos_is_named_and_the_others_are_right_also_where_they_are_fewer(photos):
+    rng = np.random.default_rng(1)
+    albedo = lit_table.with_object(lit_table.table(rng))
+    sent = [lit_table.flashlight(2 * np.pi * 5 * k / N, 0.03) for k in range(N)]
+    room = 0.15 * np.median(sent, axis=0)
+    taken = [lit_table.photograph(albedo * (x + room * (k in photos)), rng) for k, x in enumerate(sent)]
+    found = check_stack(lit_table.stack_of(taken))
+    assert {(one.photo.name, one.kind) for one in found if one.drop} == {
+        (f"IMG_{k}.jpg", "ambient light") for k in photos
+    }
+
+
+@pytest.mark.parametrize("kind", ["normal", "laplace", "standard_t"])
+def test_numbers_of_one_group_are_hardly_ever_two(kind):
+    rng = np.random.default_rng(2)
+    draw = getattr(rng, kind)
+    drawn = [draw(3, size=24) if kind == "standard_t" else draw(size=24) for _ in range(200)]
+    assert sum(second_group(one, 0.01) is not None for one in drawn) <= 6
+    found = [second_group(one + 15 * (np.arange(24) > 12), 0.01) for one in drawn]
+    assert np.mean([one is not None and (one == (np.arange(24) > 12)).mean() > 0.9 for one in found]) > 0.9
+
+
+def test_a_number_that_is_not_known_is_in_no_group():
+    values = np.array([0.0] * 8 + [0.5] * 8 + [np.nan])
+    groups = second_group(values, STEADY)
+    assert groups is not None and groups.tolist() == [False] * 8 + [True] * 8 + [False]
+    assert np.isnan(levels(values, STEADY)[-1]) and set(levels(values, STEADY)[:-1]) == {0.0, 0.5}
+
+
+@pytest.mark.parametrize("cause", [None, "power", "second light"])
+def test_lights_are_looked_for_once_more_at_most_and_only_where_photos_were_left_out(lights, monkeypatch, cause):
+    """The bound on the work, counted in fits: trouble at most doubles them, also if the second fit is no better."""
+    truth, asked = photograph(Recipe(lights=lights), 3), []
+
+    def search(session, stack, posed_camera, usable, *_):
+        asked.append(int(usable.sum()))
+        own = tuple(x for x, use in zip(truth.lights, usable, strict=True) if use)
+        return LightFit(own, (), np.zeros(3)), []
+
+    mixed = None if cause is None else MixedLight(cause, np.arange(N) < 5, 2.0)
+    residuals = {"board": "checkerboard:9x6:20", "notes": [], "pose_covariance": np.zeros((6, 6)).tolist()}
+    sheet = SimpleNamespace(on_sheet=lambda corners: corners)
+    monkeypatch.setattr(glue, "fit_board", lambda *_: (POSED_CAMERA, sheet, residuals))
+    monkeypatch.setattr(glue, "_lights", search)
+    monkeypatch.setattr(glue, "_mixture", lambda *_: mixed)
+    found = glue.calibrate(Session(Path("capture"), (), truth.stack.paths, (), (), SessionSettings()), truth.stack)
+    assert asked == ([N, N - 5] if cause == "second light" else [N])
+    left = [light.photo for light in found.lights if not light.used]
+    assert left == ([x.photo for x in truth.lights[:5]] if cause == "second light" else [])
+    assert len(found.residuals["warnings"]) == (cause is not None)
