@@ -126,7 +126,7 @@ def reduced(
 
 
 def _colours(
-    rgb: Float[np.ndarray, "photos height width 3"], grey: Maps
+    rgb: Float[np.ndarray, "photos height width 3"], grey: Float[np.ndarray, "photos small_height small_width"]
 ) -> Float16[np.ndarray, "photos small_height small_width 2"]:
     """Return the photos' colours on the pixel grid of their grey."""
     found = np.empty((*grey.shape, 2), np.float16)
