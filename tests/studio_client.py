@@ -37,7 +37,10 @@ class Client:
         cookie = {"Cookie": self.cookie} if self.cookie else {}
         connection.request(method, path, body, own | cookie | self.headers | headers)
         answer = connection.getresponse()
-        answer.content = answer.read()
+        try:
+            answer.content = answer.read()
+        except ConnectionResetError:  # a server may refuse a request, and close, before it has read all of it
+            answer.content = b""
         connection.close()
         return answer
 
