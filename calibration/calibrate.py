@@ -1,8 +1,9 @@
 """A session becomes a calibration: the camera and the ground from the board, then a light for every photo."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -74,7 +75,8 @@ def calibrate(
         fit = locate_sun(stack, posed_camera, usable, declared.solids)
         notes = ["lights: from the shadows of declared objects"]
     else:
-        fit, notes, spoilt, mixtures = _unmixed(session, stack, posed_camera, usable, board, lights, cues)
+        find = partial(_lights, session, stack, posed_camera, board, lights, cues)
+        fit, notes, spoilt, mixtures = _unmixed(find, stack, usable)
         usable = usable & ~spoilt
         dropped |= {path.name: SECOND_LIGHT for path, one in zip(stack.paths, spoilt, strict=True) if one}
         if declared.solids:
@@ -133,19 +135,18 @@ def left_out(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[dict[str, 
 
 
 def _unmixed(
-    session: Session,
+    find: Callable[[Bool[np.ndarray, " photos"]], tuple[LightFit, list[str]]],
     stack: PhotoStack,
-    posed_camera: PosedCamera,
     usable: Bool[np.ndarray, " photos"],
-    board: AnyBoard,
-    lights: str,
-    cues: MetricCues,
 ) -> tuple[LightFit, list[str], Bool[np.ndarray, " photos"], list[str]]:
     """Return the lights, notes, which usable photos a second light spoilt, and what is said of light that is mixed.
 
     Without the spoilt photos lights are looked for once more, and never again: trouble at most doubles the work.
+
+    Args:
+        find: finds the lights of some photos, and notes, as _lights does.
     """
-    fit, notes = _lights(session, stack, posed_camera, usable, board, lights, cues)
+    fit, notes = find(usable)
     mixed, spoilt = _mixture(fit, stack, usable), np.zeros_like(usable)
     if mixed is None:
         return fit, notes, spoilt, []
@@ -153,7 +154,7 @@ def _unmixed(
     spoilt[usable] = mixed.spoilt()
     if not spoilt.any() or (usable & ~spoilt).sum() < MIN_PHOTOS:
         return fit, notes, np.zeros_like(usable), said
-    return *_lights(session, stack, posed_camera, usable & ~spoilt, board, lights, cues), spoilt, said
+    return *find(usable & ~spoilt), spoilt, said
 
 
 def _mixture(fit: LightFit, stack: PhotoStack, usable: Bool[np.ndarray, " photos"]) -> MixedLight | None:
@@ -166,10 +167,10 @@ def _lights(
     session: Session,
     stack: PhotoStack,
     posed_camera: PosedCamera,
-    usable: Bool[np.ndarray, " photos"],
     board: AnyBoard,
     lights: str,
     cues: MetricCues,
+    usable: Bool[np.ndarray, " photos"],
 ) -> tuple[LightFit, list[str]]:
     """Return the lights, found by the requested method, and notes for the user about the choice."""
     if lights == "phone" and not session.light:

@@ -108,7 +108,8 @@ def test_lights_are_looked_for_once_more_at_most_and_only_where_photos_were_left
     """The bound on the work, counted in fits: trouble at most doubles them, also if the second fit is no better."""
     truth, asked = photograph(Recipe(lights=lights), 3), []
 
-    def search(session, stack, posed_camera, usable, *_):
+    def search(*given):
+        usable = given[-1]
         asked.append(int(usable.sum()))
         own = tuple(x for x, use in zip(truth.lights, usable, strict=True) if use)
         return LightFit(own, (), np.zeros(3)), []
