@@ -186,7 +186,7 @@ def main() -> int:
     sheet = Sheet(options.table, f"seed {options.seed}, from folder {options.first}")
     tally = Tally()
     end = time.monotonic() + options.seconds
-    with tempfile.TemporaryDirectory() as name:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         work = Path(name)
         _in_a_child(lambda: damaged_runs.make(work / "base"))
         _in_a_child(lambda: damaged_runs.make_several(work / "several"))
@@ -251,8 +251,8 @@ def _damaged_case(work: Path, number: int, draw: random.Random) -> tuple[Path, s
 def warm_up(work: Path) -> None:
     """Import what the commands import on the undamaged run, so that no child has to; they must start no thread."""
     listed = work / "modules"
-    for name in COMMANDS:
-        case = work / "warm"
+    for number, name in enumerate(COMMANDS):
+        case = work / f"warm{number}"
         shutil.copytree(work / "base" / "heap", case / "heap")
 
         def tell(case: Path = case, name: str = name) -> None:
@@ -271,7 +271,7 @@ def warm_up(work: Path) -> None:
         for module in listed.read_text().splitlines():
             with contextlib.suppress(ImportError, AttributeError):
                 importlib.import_module(module)
-        shutil.rmtree(case)
+        shutil.rmtree(case, ignore_errors=True)
     for context in (cpu_target.typing_context, cpu_target.target_context):
         context.refresh()  # of numba: what every first call of a kernel would do
 
