@@ -105,7 +105,8 @@ def _print_result(out: Path, console: Console) -> None:
     lines = [f"{used} of {len(photos)} photos used", *(f"left out: {text}" for text in unused)]
     lines += dict.fromkeys(filter(None, (scale_sentence(view.calibration.residuals) for view in views)))
     lines += dict.fromkeys(str(note) for view in views for note in view.calibration.residuals.get("notes", []))
-    warnings = report.get("warnings", [])
+    of_lights = [text for view in views for text in view.calibration.residuals.get("warnings", [])]
+    warnings = report.get("warnings", list(dict.fromkeys(map(str, of_lights))))  # a calibration alone leaves no report
     print_lines(console, *lines, *(f"warning: {text}" for text in warnings), f"Results in {out}")
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from lit_table import save_photo
 from PIL import Image
+from rich.console import Console
 from small_example import small_example
 
 import shadowgraph
@@ -23,6 +24,7 @@ from capture.errors import CaptureError
 from capture.session.seen import SeenPhotos
 from capture.session.session import load_session
 from capture.session.sorting import ROLE_FOLDERS
+from shadowgraph.run_command import _print_result
 
 LIT = [f"IMG_{101 + k}.jpg" for k in range(6)]
 
@@ -248,3 +250,10 @@ def test_a_calibration_names_the_photos_that_were_left_out(tmp_path, capsys):
     log = (tmp_path / "run" / "log.jsonl").read_text()
     assert all(f"{name} is left out" in log for name in (photos[1].name, "IMG_0109 (1).jpg", "board/IMG_0003.jpg"))
     assert "8 of 10 photos used" in said and f"left out: {photos[1].name}" in said
+    warnings = ["from a.jpg on the light is 0.55 times as bright", "in a.jpg and b.jpg a second light is on"]
+    calibration["residuals"]["warnings"] = warnings * 2  # of two views
+    (tmp_path / "run" / "calibration.json").write_text(json.dumps(calibration))
+    _print_result(tmp_path / "run", Console(width=200))
+    assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: ")] == [
+        f"warning: {text}" for text in warnings
+    ]
