@@ -67,7 +67,7 @@ def outline_maps(
     if not mask.any():
         return None
     rows, columns = np.nonzero(mask)
-    lowest = rows >= np.quantile(rows, 0.97)
+    lowest = rows > min(np.quantile(rows, 0.97), rows.max() - 1)
     foot = points[rows[lowest], columns[lowest]].mean(0)
     pixel = float(np.linalg.norm(foot - camera.centre)) / camera.camera.fx
     size = pixel * max(np.ptp(rows), np.ptp(columns), 1)
