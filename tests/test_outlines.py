@@ -14,9 +14,10 @@ from calibration.ground.ground_shadows import GroundShadows, find_shadows
 from calibration.ground.mirror_highlights import MirrorHighlights, find_highlights
 from calibration.lights.ground_cells import ground_points
 from calibration.outlines.carried_light import offset_by_outlines
-from calibration.outlines.coherence import PENUMBRA, residuals, softness
+from calibration.outlines.coherence import FINE, PENUMBRA, residuals, softness
+from calibration.outlines.coherence_kernels import BETTER
 from calibration.outlines.metric_cues import MetricCues
-from calibration.outlines.outline_maps import PIXEL_ERROR, outline_maps, with_cues
+from calibration.outlines.outline_maps import PIXEL_ERROR, TALLEST, outline_maps, with_cues
 from calibration.outlines.shadow_start import STARTS, shadow_starts
 from calibration.outlines.terms import DROP_OUTLINE, FALSE_SPOT, OutlineTerms
 from calibration.pose import Pose
@@ -56,15 +57,45 @@ def test_derivatives_are_those_of_differences(ball):
     assert np.corrcoef(slope[same], numeric[same])[0, 1] > 0.97
 
 
-def test_where_a_search_along_rays_begins_changes_nothing(ball):
+def _at_many_heights(maps, lights: np.ndarray, start: np.ndarray, own: int) -> float:
+    """Emptiness of a ray by brute force: 4000 heights, every view at each."""
+    views, soft = np.concatenate([lights, EYE[None]]), np.append(softness(maps, lights), 0.0)
+    heights = np.linspace(0, TALLEST * maps.size, 4000)
+    ray = start + (views[own, :2] - start) * heights[:, None] / views[own, 2]
+    proven = np.full((len(views), len(heights)), -np.inf)
+    for k, view in enumerate(views):
+        if k != own:
+            at = ray + (ray - view[:2]) * (heights / (view[2] - heights))[:, None]
+            place = ((at - maps.corner) / maps.cell - 0.5).astype(np.float32)
+            inside = np.clip(place, 0, len(maps.fields[k]) - 1.01) if k == len(lights) else place
+            value = cv2.remap(maps.fields[k], inside[:, 1], inside[:, 0], cv2.INTER_LINEAR, borderValue=-1e3)
+            wide = np.sqrt(1 + heights**2 * (soft[own] ** 2 + soft[k] ** 2))
+            proven[k] = value * (view[2] - heights) / view[2] / wide
+    return max(float(proven.max(0).min()), 0.0)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.02, 0.1])
+def test_a_ray_meets_what_it_only_grazes(ball, off):
+    """Rays beside an outline cross a millimetre of the object: looks at fixed heights pass over it."""
+    _, lights, maps = ball
+    wrong = lights * (1 + off * np.random.default_rng(2).standard_normal(lights.shape))
+    maps.first_height[:] = 0
+    found = residuals(maps, wrong, EYE, np.ones(len(lights), bool))
+    some = np.random.default_rng(3).choice(len(found.emptiness), 60, replace=False)
+    least = [_at_many_heights(maps, wrong, maps.starts[k], int(found.owner[k])) for k in some]
+    above = found.emptiness[some] - np.array(least)
+    assert (above < FINE * maps.pixel + BETTER * np.array(least) + 0.01 * maps.pixel).all()
+    assert (above > -0.03 * maps.pixel - 0.01 * np.array(least)).all()
+
+
+def test_where_a_search_along_rays_begins_changes_next_to_nothing(ball):
     _, lights, maps = ball
     every, rng = np.ones(len(lights), bool), np.random.default_rng(0)
     wrong = lights * (1 + 0.05 * rng.standard_normal(lights.shape))
     first = residuals(maps, wrong, EYE, every)
-    maps.first_step[:] = rng.integers(0, 40, len(maps.first_step))
+    maps.first_height[:] = rng.uniform(0, TALLEST * maps.size, len(maps.first_height))
     again = residuals(maps, wrong, EYE, every)
-    np.testing.assert_array_equal(again.emptiness, first.emptiness)
-    np.testing.assert_array_equal(again.d_by, first.d_by)
+    np.testing.assert_allclose(again.emptiness, first.emptiness, BETTER / (1 - BETTER), FINE * maps.pixel)
     assert 0.1 < (first.emptiness > 0).mean() < 1 and first.emptiness.min() == 0
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from calibration.outlines.outline_maps import PIXEL_ERROR, TALLEST, OutlineMaps
 
 BY_SPACE = -2  # as in coherence_kernels: the space that photos from the side prove empty
-HEIGHTS = 40  # points along a ray
+FINE = 0.02  # px: an emptiness of less is none, far below the outlines' own error
 PENUMBRA = 0.01  # of the object's size: how far the seen edge of a penumbra lies off
 SLOPE_STEP = 0.5  # cells: half the step of the central differences
 
@@ -59,9 +59,9 @@ def residuals(
     by = np.empty(len(starts), np.int64)
     soft = np.append(softness(maps, lights), 0.0)
     where = _where(maps, views, takes_part.astype(np.uint8), soft)
-    first_step = maps.first_step[chosen]
-    least_empty(starts, owner, *where, _heights(maps), first_step, emptiness, height, by)
-    maps.first_step[chosen] = first_step
+    first = maps.first_height[chosen]
+    least_empty(starts, owner, *where, TALLEST * maps.size, FINE * maps.pixel, first, emptiness, height, by)
+    maps.first_height[chosen] = first
     light, h = views[owner], height[:, None]
     at = np.concatenate([starts + (light[:, :2] - starts) * h / light[:, 2:], h], 1)
     slope, d_by = _derivatives(maps, views, at, by)
@@ -89,10 +89,6 @@ def softness(maps: OutlineMaps, lights: Float[np.ndarray, "photos 3"]) -> Float[
     """
     reach = np.linalg.norm(lights - [*maps.foot[:2], 0.0], axis=1)
     return PENUMBRA * maps.size * reach / np.maximum(lights[:, 2], 1e-9) ** 2 / (PIXEL_ERROR * maps.pixel)
-
-
-def _heights(maps: OutlineMaps) -> Float[np.ndarray, " heights"]:
-    return np.linspace(0, TALLEST * maps.size, HEIGHTS + 1)[1:]
 
 
 def _where(maps: OutlineMaps, views: np.ndarray, used: np.ndarray, soft: np.ndarray):

@@ -1,4 +1,9 @@
-"""Compiled search along the rays of outlines for the point that the fewest views prove empty."""
+"""Compiled search along the rays of outlines for the point that the views prove least empty.
+
+How far a view proves a point empty falls along a ray at most as fast as the two rays' slopes differ. So a search need
+not look where the last proof still holds [Hart, Sphere tracing, The Visual Computer 12 (1996)]. It finds an edge that a
+ray only grazes, which looks at fixed heights pass over.
+"""
 
 from typing import Any
 
@@ -8,6 +13,7 @@ from numba import njit, prange
 STRIDE = 5  # of the first look along a ray
 OUTSIDE = -1e3  # of a map: unknown, so nothing is proven there
 BY_SPACE = -2  # in place of a view: a posed camera from the side, or the object's height
+BETTER = 0.02  # of the least that was found: less of an improvement is not looked for
 
 # Called by kernels of this file alone: no entries for Python or C are compiled. A call from Python ends the process.
 INNER: dict[str, Any] = {
@@ -71,13 +77,6 @@ def _by_space(x, y, h, space, space_corner, space_cell, softness):
 
 
 @njit(**INNER)
-def _on_ray(start, view, h):
-    """Where the ray from a ground point to a view is at height h."""
-    share = h / view[2]
-    return start[0] + (view[0] - start[0]) * share, start[1] + (view[1] - start[1]) * share
-
-
-@njit(**INNER)
 def _coarse_first(step, count):
     """The step-th number of 0 .. count - 1 in strides: a good point is known early, and most others end at one view."""
     long = count % STRIDE  # strides with one number more
@@ -116,6 +115,21 @@ def _emptiest(x, y, h, own, best, first, views, used, fields, corner, cell, soft
     return worst, worst_view
 
 
+@njit(**INNER)
+def _fall(x, y, h, value, own, view, views, soft, across, up):
+    """Return by how much per height what a view proves along a ray can fall.
+
+    Args:
+        value: what it proves at the point; across, up: the ray's slope, horizontal lengths per height.
+    """
+    if view < 0:
+        return np.sqrt(1 + across * across + up * up)
+    left = views[view, 2] - h
+    apart = np.hypot(across - (views[view, 0] - x) / left, up - (views[view, 1] - y) / left)
+    softer = h * (soft[own] ** 2 + soft[view] ** 2)
+    return apart + abs(value) * (1 / views[view, 2] + softer / (1 + h * softer))
+
+
 @njit(cache=True, nogil=True, parallel=True)
 def least_empty(
     starts,
@@ -129,8 +143,9 @@ def least_empty(
     space,
     space_corner,
     space_cell,
-    heights,
-    first_step,
+    top,
+    fine,
+    first_height,
     emptiness,
     height,
     by,
@@ -145,30 +160,35 @@ def least_empty(
         fields: (views, n, n) signed distances; corner, cell: of the maps.
         soft: (views,) softness of a view's edges per height; see coherence.softness; the camera's, the last, is 0.
         space: (x, y, z) what is proven without lights, or of size 0; space_corner, space_cell: of its nodes.
-        heights: (h,) above the ground.
-        first_step: (rays,) number of the height that is looked at first, replaced by the one found: a good height that
-            is known early lets all others end after a view or two.
+        top: the greatest height; fine: an emptiness of less is none, world length.
+        first_height: (rays,) height that is looked at first, replaced by the one found: a good height that is known
+            early lets the search skip most others.
         emptiness, height, by: (rays,) outputs: world length, height, index of the deciding view (-1: none, BY_SPACE).
     """
     for ray in prange(len(starts)):
         own = owner[ray]
-        best, best_height, best_view, last, found = 1e9, heights[0], -1, -1, first_step[ray]
-        for step in range(-1, len(heights)):
-            number = first_step[ray] if step < 0 else _coarse_first(step, len(heights))
-            h = heights[number]
-            if h >= 0.98 * views[own, 2] or (step >= 0 and number == first_step[ray]):
-                continue
-            x, y = _on_ray(starts[ray], views[own], h)
+        across = (views[own, 0] - starts[ray, 0]) / views[own, 2]
+        up = (views[own, 1] - starts[ray, 1]) / views[own, 2]
+        highest = min(top, 0.98 * views[own, 2])
+        best, best_height, best_view, last = 1e9, 0.0, -1, -1
+        h, is_first = min(first_height[ray], highest), True
+        while h <= highest:
+            x, y = starts[ray, 0] + across * h, starts[ray, 1] + up * h
             worst, last = _emptiest(
                 x, y, h, own, best, last, views, used, fields, corner, cell, soft, space, space_corner, space_cell
             )
             if worst < best:
-                best, best_height, best_view, found = worst, h, last, number
+                best, best_height, best_view = worst, h, last
             if best <= 0:
                 best, best_view = 0.0, -1
                 break
+            if is_first:
+                h, is_first = 0.0, False
+            else:
+                promise = worst - (1 - BETTER) * best + fine
+                h += promise / max(_fall(x, y, h, worst, own, last, views, soft, across, up), 1e-6)
         emptiness[ray], height[ray], by[ray] = best, best_height, best_view
-        first_step[ray] = found
+        first_height[ray] = best_height
 
 
 @njit(cache=True, nogil=True)  # little work: in parallel it would take longer to compile than it saves

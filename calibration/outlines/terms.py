@@ -9,7 +9,7 @@ from calibration.ground.mirror_highlights import MirrorHighlights
 from calibration.outlines.coherence import Residuals, residuals
 from calibration.outlines.outline_maps import PIXEL_ERROR, OutlineMaps
 
-DROP_OUTLINE = 1.5  # px: right lights stay below 0.6, but where the picture cuts a shadow
+DROP_OUTLINE = 1.0  # px: right lights stay below 0.6
 SERIES = 0.3  # spread of log distances of a handheld light from the object, as an arm moves
 SAME = 6.0  # neighbouring rays that are wrong together; sums of correlations: 8 to 18, of which Cauchy forgives some
 LOOKS = 2  # that are remembered: of a state, and of the step that is tried from it
