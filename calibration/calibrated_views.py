@@ -17,8 +17,6 @@ from capture.files.atomic import write_json
 from capture.files.json_field import JsonField, read_document
 from capture.session.capture import MOST_LIES, MOST_VIEWS
 
-ENTRIES = ("view", "further_views", "left_out", "lie", "lies")  # of the file, besides those of Calibration
-
 
 @dataclass(frozen=True, eq=False)
 class CalibratedView:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from calibration.board import recognise
 from calibration.board.board import Board, opencv_dictionary, parse_board
-from calibration.board.board_pose import board_views, fit_ground, locate_ground
+from calibration.board.board_pose import board_views, fit_ground
 from calibration.board.corners import Corners, find_board
 from calibration.board.recognise import _layout, guess_board
 from calibration.camera import Camera
@@ -228,7 +228,7 @@ def test_nothing_is_guessed_where_there_is_no_board():
 
 
 def test_the_pose_has_its_origin_at_the_board_and_z_up():
-    pose = locate_ground(corners_of(CHARUCO, CAMERA, POSE), CAMERA)
+    pose = fit_ground(corners_of(CHARUCO, CAMERA, POSE), CAMERA).world_from_camera
     assert np.allclose(pose.matrix(), POSE.matrix(), atol=1e-5)  # mm; the optimiser stops at 1e-8 relative
     assert pose.translation[2] > 0
 
@@ -258,33 +258,33 @@ def test_two_poses_that_explain_the_corners_alike_are_refused_not_chosen_between
         best = board_views(corners, CAMERA)[0].camera_from_world.inverse()
         wrong += normal_error(best, truth) > np.radians(15)
         with pytest.raises(CalibrationError, match="equally well"):
-            locate_ground(corners, CAMERA)
+            fit_ground(corners, CAMERA)
     assert wrong > 0  # the smaller error alone would have taken the mirrored pose
 
 
 def test_a_mirrored_photo_is_refused():
     seen = corners_of(CHARUCO, CAMERA, POSE)
     with pytest.raises(CalibrationError, match="mirrored"):
-        locate_ground(Corners(seen.pixels * [-1, 1] + [1000, 0], seen.points, CHARUCO), CAMERA)
+        fit_ground(Corners(seen.pixels * [-1, 1] + [1000, 0], seen.points, CHARUCO), CAMERA)
 
 
 def test_a_small_far_board_is_refused_with_advice():
     far = slanted(np.random.default_rng(8), 0.3, 6000)
     with pytest.raises(CalibrationError, match="Photograph the board larger"):
-        locate_ground(corners_of(CHARUCO, CAMERA, far, 0.3, np.random.default_rng(9)), CAMERA)
+        fit_ground(corners_of(CHARUCO, CAMERA, far, 0.3, np.random.default_rng(9)), CAMERA)
 
 
 def test_the_wrong_board_is_refused():
     seen = corners_of(CHARUCO, CAMERA, POSE)
     swapped = seen.points.reshape(6, 4, 3)[:, [0, 2, 1, 3]].reshape(-1, 3)  # two columns of corners exchanged
     with pytest.raises(CalibrationError, match=r"px off.*columns and rows"):
-        locate_ground(Corners(seen.pixels, swapped, CHARUCO), CAMERA)
+        fit_ground(Corners(seen.pixels, swapped, CHARUCO), CAMERA)
 
 
 def test_four_corners_are_too_few_for_the_ground():
     seen = corners_of(CHARUCO, CAMERA, POSE)
     with pytest.raises(CalibrationError, match="4 corners"):
-        locate_ground(Corners(seen.pixels[[0, 3, 20, 23]], seen.points[[0, 3, 20, 23]], CHARUCO), CAMERA)
+        fit_ground(Corners(seen.pixels[[0, 3, 20, 23]], seen.points[[0, 3, 20, 23]], CHARUCO), CAMERA)
 
 
 def test_the_stated_sigma_of_the_normal_is_its_spread():
@@ -312,6 +312,6 @@ def test_the_stated_sigma_of_the_height_is_its_spread():
 @pytest.mark.parametrize("height", [300.0, 500.0, 523.3446145170113])
 def test_a_board_without_any_noise_that_faces_the_camera_has_a_pose(height, aside):
     pose = look_at((75.0, -105.0 + aside, height))
-    found = locate_ground(corners_of(CHARUCO, CAMERA, pose), CAMERA)
+    found = fit_ground(corners_of(CHARUCO, CAMERA, pose), CAMERA).world_from_camera
     assert normal_error(found, pose) < 1e-4
     assert np.allclose(found.translation, pose.translation, atol=0.05)

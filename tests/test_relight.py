@@ -1,6 +1,7 @@
 """Truth: a sphere over a plane, whose shadow, depth and view of the sky have closed forms."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +11,11 @@ from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
-from reconstruct.appearance.brdf import MATERIALS, Material, reflectance
+from reconstruct.appearance.brdf import MATERIALS, Gloss, Material, conserving, reflectance
 from reconstruct.fields import Fields
-from reconstruct.render.environment import SKIES, WHITE_PAPER, exposed, ground_light, sky_lights
+from reconstruct.render.environment import WHITE_PAPER, exposed, ground_light, patches, sky_lights
 from reconstruct.render.g_buffer import RenderView, look, surface_maps
-from reconstruct.render.material_edit import Edit, GroundRegion, ObjectRegion, apply_edits
-from reconstruct.render.relight import environment, environment_steps, last, lit_share, relight, relight_soft
+from reconstruct.render.relight import environment, lit_share, relight, relight_soft
 from reconstruct.sdf.grid import SdfGrid
 
 CENTRE, RADIUS = torch.tensor([0.1, -0.1, 0.6]), 0.45
@@ -46,7 +46,20 @@ def fields(albedo: torch.Tensor | None = None) -> Fields:
 
 
 def everywhere(view: RenderView, material: Material) -> RenderView:
-    return apply_edits(view, [Edit(material, ObjectRegion()), Edit(material, GroundRegion())])
+    """Put one material on all that is seen; it reflects at most all light."""
+    lobes, seen = material.coefficients(), torch.isfinite(view.maps.depth)
+    points, normals = view.maps.points[seen], view.maps.normals[seen]
+    cosine = (normals * torch.nn.functional.normalize(view.eye - points, dim=-1)).sum(-1)
+    albedo, colour = view.albedo.clone(), torch.tensor(material.albedo).expand(len(points), 3)
+    albedo[seen], _ = conserving(colour, lobes.expand(len(points), *lobes.shape), cosine)
+    return replace(view, albedo=albedo, gloss=Gloss(lobes[None], seen[..., None].float()))
+
+
+def evening(size: tuple[int, int]) -> torch.Tensor:
+    """A low sun of one texel, which sends about half of all light, in a sky that is brighter overhead."""
+    sky = patches(size)[0][..., 2:].clamp(min=0) * torch.tensor([0.3, 0.5, 1.0])
+    sky[2 * size[0] // 5, size[1] // 20] = 0.1 * size[0] * size[1] * torch.tensor([1.0, 0.6, 0.3])
+    return sky
 
 
 @pytest.fixture(scope="module")
@@ -203,12 +216,9 @@ def brute_force(view: RenderView, radiance: torch.Tensor, turn: float = 0.0) -> 
     return total
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(sky, marks=pytest.mark.slow) if sky != "sunset" else sky for sky in SKIES]
-)
-def test_a_surrounding_equals_the_sum_over_all_texels_to_a_hundredth(name):
+def test_a_surrounding_equals_the_sum_over_all_texels_to_a_hundredth():
     small = look(fields(), width=20)
-    radiance = exposed(SKIES[name]((16, 32)))
+    radiance = exposed(evening((16, 32)))
     exact = brute_force(small, radiance, turn=0.7)
     error = (environment(small, radiance, rows=16, turn=0.7) - exact).abs()
     assert error.mean() < 0.01 * exact.mean() and error.max() < 0.01 * exact.max()
@@ -217,19 +227,18 @@ def test_a_surrounding_equals_the_sum_over_all_texels_to_a_hundredth(name):
 @pytest.mark.slow  # 10 s: 576 pictures of one texel each
 def test_fewer_and_larger_patches_stay_close_to_the_sum_over_all_texels():
     small = look(fields(), width=20)
-    radiance = exposed(SKIES["overcast"]((24, 48)))
+    radiance = exposed(evening((24, 48)))
     exact = brute_force(small, radiance)
     assert (environment(small, radiance, rows=12) - exact).abs().mean() < 0.01 * exact.mean()
 
 
-def test_white_paper_on_open_ground_is_as_bright_under_every_sky_made_by_formula():
+@pytest.mark.parametrize("sky", [evening((64, 128)), torch.ones(64, 128, 3), 7 * evening((64, 128)).roll(9, 1)])
+def test_white_paper_on_open_ground_is_as_bright_under_every_sky(sky):
     free = look(Fields(SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01), *fields_rest()), width=8)
-    for name, make in SKIES.items():
-        sky = exposed(make())
-        assert sky[len(sky) // 2 :].max() == 0, name
-        white = environment(free, sky) / free.albedo
-        assert torch.allclose(white, ground_light(sky).expand_as(white), rtol=0.02), name
-        assert abs(float(white[0, 0] @ torch.tensor([0.2126, 0.7152, 0.0722])) / WHITE_PAPER - 1) < 0.02, name
+    sky = exposed(sky)
+    white = environment(free, sky) / free.albedo
+    assert torch.allclose(white, ground_light(sky).expand_as(white), rtol=0.02)
+    assert abs(float(white[0, 0] @ torch.tensor([0.2126, 0.7152, 0.0722])) / WHITE_PAPER - 1) < 0.02
 
 
 def test_a_turned_surrounding_is_that_of_a_turned_map(view):
@@ -237,18 +246,6 @@ def test_a_turned_surrounding_is_that_of_a_turned_map(view):
     radiance[3, 4] = 1.0
     quarter = environment(view, radiance, turn=math.pi / 2)
     assert torch.allclose(quarter, environment(view, radiance.roll(8, 1)), atol=1e-5)
-
-
-def test_a_quick_look_computes_the_object_and_interpolates_the_ground():
-    small = look(fields(), width=60)
-    radiance = exposed(SKIES["window"]((16, 32)))
-    exact = environment(small, radiance, rows=4)
-    quick = last(environment_steps(small, radiance, 4, every=2))
-    mask = small.maps.mask
-    torch.testing.assert_close(quick[mask], exact[mask])
-    torch.testing.assert_close(quick[::2, ::2], exact[::2, ::2])
-    assert (quick - exact).abs()[~mask].mean() < 0.02 * exact[~mask].mean()
-    assert not torch.equal(quick, exact), "then nothing was saved"
 
 
 def test_a_small_sun_stays_in_its_place_in_a_large_patch():
@@ -269,8 +266,10 @@ def test_averaging_a_fine_map_keeps_its_power():
         assert torch.allclose(sky_lights(radiance, rows)[1].sum(0), exact, rtol=1e-4), rows
 
 
-def test_a_sun_that_is_a_disc_is_several_lights_and_an_even_sky_is_not_divided_further():
-    _, power = sky_lights(exposed(SKIES["sunset"]()), 12)
+def test_a_bright_sun_is_several_lights_and_an_even_sky_is_not_divided_further():
+    sky = torch.ones(72, 144, 3)
+    sky[20:23, 30:33] = 2000.0
+    _, power = sky_lights(sky, 12)
     assert (power.sum(-1) < 0.15 * power.sum()).all() and len(power) > 6 * 24
     assert len(sky_lights(torch.ones(64, 128, 3), 12)[1]) == 6 * 24
 
@@ -323,26 +322,13 @@ def test_in_a_white_furnace_a_surface_shows_what_it_reflects_and_never_more_than
 
 def test_a_highlight_lies_where_the_ball_mirrors_the_lamp(view):
     light = Light("p", "point", np.array([1.2, -2.0, 2.5]))
-    shine = relight(apply_edits(view, [Edit(MATERIALS["gold"], ObjectRegion())]), light)[..., 0]
+    shine = relight(everywhere(view, MATERIALS["gold"]), light)[..., 0]
     brightest = torch.nonzero(shine == shine[view.maps.mask].max())[0]
     row, column = int(brightest[0]), int(brightest[1])
     point, normal = view.maps.points[row, column], view.maps.normals[row, column]
     to_light = torch.nn.functional.normalize(torch.tensor([1.2, -2.0, 2.5]) - point, dim=0)
     halfway = torch.nn.functional.normalize(to_light + torch.nn.functional.normalize(view.eye - point, dim=0), dim=0)
     assert normal @ halfway > math.cos(math.radians(6))  # a pixel spans about five degrees of the ball
-
-
-def test_another_material_on_the_object_leaves_the_ground_alone(view):
-    light = Light("p", "point", np.array([0.0, -1.0, 3.0]))
-    before, after = relight(view, light), relight(apply_edits(view, [Edit(MATERIALS["gold"], ObjectRegion())]), light)
-    assert torch.equal(before[~view.maps.mask], after[~view.maps.mask])
-    assert (before[view.maps.mask] - after[view.maps.mask]).abs().max() > 0.01
-
-
-def test_plastic_keeps_the_colour_that_was_recovered(view):
-    plastic = everywhere(view, MATERIALS["plastic"])
-    assert torch.equal(plastic.albedo, view.albedo)
-    assert plastic.gloss is not None and plastic.gloss.weights.sum() == view.maps.depth.isfinite().sum()
 
 
 def test_pixels_that_see_no_light_are_in_shadow(view):

@@ -64,19 +64,10 @@ class PoseSpread:
     table: Float[np.ndarray, "3 3"]  # covariance of the table's height over z = 0 at the board's middle, and its slopes
 
 
-def locate_ground(corners: Corners, camera: Camera) -> Pose:
-    """Return world_from_camera of the photo in which these corners were seen; the board's printed side is z = 0, mm.
-
-    Raises:
-        CalibrationError: too few corners, a mirrored board, or two poses that explain them about equally well.
-    """
-    return fit_ground(corners, camera).world_from_camera
-
-
 def fit_ground(
     corners: Corners, camera: Camera, spread: PoseSpread | None = None, robust_at: float = ROBUST_AT
 ) -> GroundFit:
-    """Fit the camera's pose as locate_ground does, with residual and uncertainty.
+    """Fit the pose of the photo in which these corners were seen; the board's printed side is z = 0, mm.
 
     A flat board seen from far away allows two poses (Collins and Bartoli's IPPE returns both). Both are refined to the
     smallest reprojection error; the better one is taken only if it wins clearly.
@@ -86,7 +77,7 @@ def fit_ground(
         robust_at: px from which a corner begins to count less.
 
     Raises:
-        CalibrationError: as locate_ground.
+        CalibrationError: too few corners, a mirrored board, or two poses that explain them about equally well.
     """
     if len(corners.pixels) < FEWEST_CORNERS:
         raise CalibrationError(

@@ -19,7 +19,6 @@ ICP_POINTS = 20000  # more move the result by less than the surface's own noise
 ICP_HELD = 1e-3  # of what holds the best held motion, planes must hold one for it to be made
 ICP_SETTLED = 1e-8  # change of the mean distance at which it stops
 NEAREST_TRIANGLES = 6  # of a point's nearest samples; they contain the closest triangle, except at slivers
-TIE = 1e-6  # relative: triangles with distances this equal share the nearest edge or corner
 LIFT = 1e-4  # world length: the visibility of a point is tested from just above its own triangle
 PAIRS_PER_BLOCK = 2**21  # ray-triangle pairs tested at once: 300 MB
 
@@ -234,49 +233,11 @@ def distance_to_mesh(
     Args:
         samples, faces: points on the surface and their triangles.
     """
-    gap, _, nearest = _gaps(points, mesh, samples, faces)
-    return np.minimum(np.linalg.norm(gap, axis=2).min(1, initial=np.inf), nearest)
-
-
-def signed_distance_to_mesh(
-    points: Float[np.ndarray, "n 3"],
-    mesh: trimesh.Trimesh,
-    samples: Float[np.ndarray, "m 3"],
-    faces: Int[np.ndarray, " m"],
-) -> Float[np.ndarray, " n"]:
-    """Return the distance from points to a surface, positive on the side that the triangles face.
-
-    At an edge or corner several triangles are equally near; the one whose normal best fits the offset gives the sign.
-
-    Args:
-        samples, faces: points on the surface and their triangles.
-    """
-    gap, triangle, nearest = _gaps(points, mesh, samples, faces)
-    length = np.linalg.norm(gap, axis=2)
-    with np.errstate(invalid="ignore"):  # inf times 0, at slivers
-        height = (gap * mesh.face_normals[triangle]).sum(2)
-    tied = length <= length.min(1, keepdims=True) * (1 + TIE)
-    best = np.where(tied & np.isfinite(length), np.abs(height), -1.0).argmax(1)[:, None]
-    side = np.where(np.take_along_axis(height, best, 1)[:, 0] < 0, -1.0, 1.0)
-    return side * np.minimum(length.min(1), nearest)
-
-
-def _gaps(
-    points: Float[np.ndarray, "n 3"],
-    mesh: trimesh.Trimesh,
-    samples: Float[np.ndarray, "m 3"],
-    faces: Int[np.ndarray, " m"],
-) -> tuple[Float[np.ndarray, "n k 3"], Int[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
-    """Return vectors from the closest points of nearby triangles to each point, the triangles, and a distance.
-
-    The vectors are inf for slivers; the distance is that to the nearest sample.
-    """
-    distance, index = map(np.asarray, KDTree(samples).query(points, k=NEAREST_TRIANGLES, workers=-1))
-    triangle = faces[index]
+    nearest, index = map(np.asarray, KDTree(samples).query(points, k=NEAREST_TRIANGLES, workers=-1))
     repeated = np.repeat(points, NEAREST_TRIANGLES, 0)
-    gap = repeated - trimesh.triangles.closest_point(np.asarray(mesh.triangles)[triangle.reshape(-1)], repeated)
+    gap = repeated - trimesh.triangles.closest_point(np.asarray(mesh.triangles)[faces[index].reshape(-1)], repeated)
     gap[~np.isfinite(gap).all(1)] = np.inf  # a sliver has no closest point
-    return gap.reshape(*triangle.shape, 3), triangle, distance[:, 0]
+    return np.minimum(np.linalg.norm(gap.reshape(*index.shape, 3), axis=2).min(1, initial=np.inf), nearest[:, 0])
 
 
 def f_score(precision: float, recall: float) -> float:

@@ -23,7 +23,7 @@ from reconstruct.export.film import checked_frames, checked_width, read_film, wi
 from reconstruct.export.video import write_film
 from reconstruct.render.environment import sky_map
 from reconstruct.render.g_buffer import RenderView, look
-from reconstruct.render.relight import environment_steps, last, relight_soft
+from reconstruct.render.relight import environment, relight_soft
 from reconstruct.render.studio import direction_of, even, studio_of, towards
 from reconstruct.stored_run.stored_run import StoredRun
 
@@ -157,7 +157,7 @@ def _picture(run: StoredRun, view: RenderView, new: NewLight) -> Float[np.ndarra
             raise ReconstructionError(
                 f"{new.env} cannot be read ({error.strerror}); a .hdr or .exr was needed."
             ) from error
-        return new.brightness * last(environment_steps(view, sky_map(panorama), SKY_ROWS, new.turn)).numpy()
+        return new.brightness * environment(view, sky_map(panorama), SKY_ROWS, new.turn).numpy()
     place = np.append(new.light, 1.0) if new.light is not None else np.append(new.direction or (), 0.0)
     return _under(run, view, new, place, LAMP_SAMPLES)
 

@@ -1,4 +1,4 @@
-"""Environment maps: patches with their solid angles, exposure, and a few maps made by formula.
+"""Environment maps: patches with their solid angles, and exposure.
 
 A radiance map is equirectangular: row 0 around +z, column j at azimuth 2 pi (j + 0.5) / columns from +x towards +y.
 """
@@ -10,15 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-MAP_SIZE = (128, 256)  # of the maps made here: a texel is 1.4 degrees
 FINER = 6  # a bright patch is divided into this many rows and columns
 BRIGHT = 0.1  # share of all light: a patch that sends more casts a visible shadow of its own
 LEAST_DIVIDED = 8  # rows: fewer are for a quick look
 WHITE_PAPER = 0.6  # linear, 80 % of full scale, on open ground: slopes that face a low sun are brighter than that
 FINEST_MAP = (256, 512)  # a texel is 0.7 degrees, a tenth of the patches that light is summed over
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear RGB, ITU-R BT.709
-
-Sky = Float[Tensor, "rows columns 3"]  # linear radiance, as above
 
 
 def sky_lights(
@@ -129,60 +126,3 @@ def sky_map(panorama: Float[np.ndarray, "rows columns 3"]) -> Float[Tensor, "map
     radiance = torch.from_numpy(panorama)
     size = min(len(radiance), FINEST_MAP[0]) // 2 * 2, min(radiance.shape[1], FINEST_MAP[1])
     return exposed(patch_power(radiance, size) * math.pi / patches(size)[1][:, None, None])
-
-
-# --- maps made by formula --------------------------------------------------------------------------------------------
-
-
-def overcast(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
-    """Return the CIE standard overcast sky, linear: L = (1 + 2 sin elevation) / 3 times the zenith radiance."""
-    height = patches(size)[0][..., 2:]
-    return torch.where(height > 0, (1 + 2 * height) / 3, 0.0).expand(*size, 3).contiguous()
-
-
-def window(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
-    """A dim warm room with one window towards +x: 60 degrees wide, 10 to 55 degrees high, a bar each way in it."""
-    directions, _ = patches(size)
-    azimuth = torch.atan2(directions[..., 1], directions[..., 0]).rad2deg()
-    elevation = torch.asin(directions[..., 2]).rad2deg()
-    glass = (azimuth.abs() < 30) & (azimuth.abs() > 1.5) & (elevation > 10) & (elevation < 55)
-    glass &= (elevation - 32).abs() > 1.5
-    room = torch.tensor([1.0, 0.86, 0.7]) * 0.04
-    return torch.where(glass[..., None], torch.tensor([0.92, 0.97, 1.0]), room) * (elevation > 0)[..., None]
-
-
-def sunset(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
-    """A low sun near +x with its glow, in a sky that is blue overhead and orange at the horizon.
-
-    The sun stands at azimuth 16 and elevation 14 degrees, which lies within one patch for any patch size. It is a disc
-    of at least 3 degrees, because a texel is wider than the real sun; it sends about half of all light.
-    """
-    directions, solid_angle = patches(size)
-    up = directions[..., 2:].clamp(min=0)
-    azimuth, elevation = math.radians(16.0), math.radians(14.0)
-    level = math.cos(elevation)
-    sun = torch.tensor([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
-    towards = directions @ sun
-    haze = torch.exp(-up / 0.18) * (0.35 + 0.65 * ((1 + towards[..., None]) / 2) ** 3)
-    sky = torch.tensor([0.16, 0.25, 0.48]) * (0.5 + 0.5 * up) + torch.tensor([1.0, 0.46, 0.16]) * haze
-    sky = sky + torch.tensor([1.0, 0.62, 0.3]) * 1.5 * torch.exp((towards[..., None] - 1) / 0.02)
-    disc = (towards > math.cos(max(math.radians(3.0), math.pi / size[0]))).float() * solid_angle[:, None]
-    power = (disc * directions[..., 2].clamp(min=0)).sum()
-    sky = sky * (directions[..., 2:] > 0)
-    colour = torch.tensor([1.0, 0.55, 0.22]) * ground_light(sky)[1] * math.pi / 0.55 / power
-    return sky + (disc > 0)[..., None] * colour
-
-
-def studio(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
-    """A dark room with a large soft light from one side (+x), a weaker one opposite and a strip from above."""
-    directions, _ = patches(size)
-    azimuth = torch.atan2(directions[..., 1], directions[..., 0]).rad2deg()
-    elevation = torch.asin(directions[..., 2]).rad2deg()
-    key = (azimuth.abs() < 35) & ((elevation - 42).abs() < 22)
-    fill = ((azimuth.abs() - 180).abs() < 22) & ((elevation - 28).abs() < 16)
-    strip = elevation > 74
-    light = key * 1.0 + fill * 0.22 + strip * 0.3
-    return (light + 0.02 * (elevation > 0))[..., None] * torch.tensor([1.0, 0.98, 0.95])
-
-
-SKIES = {"overcast": overcast, "window": window, "sunset": sunset, "studio": studio}  # by the name people choose

@@ -1,8 +1,6 @@
 """The G-buffer of a solved scene: surface_maps (depth, normals, mask), albedo_at (of any point), look (both)."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from dataclasses import fields as dataclass_fields
 from functools import cached_property
 
 import cv2
@@ -20,7 +18,6 @@ from reconstruct.render.radiosity import Patches, PatchWeights, find_patches, ne
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import first_hits
 
-PIXELS_PER_STRIP = 2**16  # of look_steps: a tenth of a second
 RAYS_PER_BLOCK = 2**18  # about 40 MB of rays at a time, for photos of any size
 SAME_DEPTH = 2.0  # voxels: a pixel that sees something nearer than a point does not see the point
 MIN_FACING = 0.15  # cosine to the view ray (about 81 degrees); below it a pixel's albedo is unreliable
@@ -353,32 +350,7 @@ def look(
     if width is not None:
         camera = posed_camera.camera
         posed_camera = posed_camera.resized(width, max(1, round(camera.height * width / camera.width)))
-    return _look(fields, posed_camera, material or seen_material(fields))
-
-
-def look_steps(fields: Fields, posed_camera: PosedCamera, material: SeenMaterial) -> Iterator[RenderView | None]:
-    """Compute `look` in parts, so that a page stays responsive: yield None after each strip of rows, then the view."""
-    camera = posed_camera.camera
-    rows, strips = max(1, PIXELS_PER_STRIP // camera.width), []
-    for top in range(0, camera.height, rows):
-        strip = posed_camera.cropped(0, top, camera.width, min(rows, camera.height - top))
-        strips.append(_look(fields, strip, material))
-        yield None
-    maps = SurfaceMaps(*(torch.cat([getattr(s.maps, f.name) for s in strips]) for f in dataclass_fields(SurfaceMaps)))
-    gloss = None
-    if fields.gloss is not None:
-        gloss = Gloss(fields.gloss.lobes, torch.cat([s.gloss.weights for s in strips if s.gloss is not None]))
-    interreflection = None
-    if material.patches is not None:
-        between = [s.interreflection.weights for s in strips if s.interreflection is not None]
-        interreflection = Interreflection(
-            *material.patches,
-            PatchWeights(torch.cat([b.index for b in between]), torch.cat([b.weight for b in between])),
-        )
-    yield RenderView(maps, torch.cat([s.albedo for s in strips]), fields.grid, strips[0].eye, gloss, interreflection)
-
-
-def _look(fields: Fields, posed_camera: PosedCamera, material: SeenMaterial) -> RenderView:
+    material = material or seen_material(fields)
     maps = surface_maps(fields.grid, posed_camera)
     seen = torch.isfinite(maps.depth)
     where = maps.points[seen], maps.mask[seen]

@@ -13,8 +13,6 @@ from reconstruct.fields import Fields
 from reconstruct.render.g_buffer import RenderView
 from reconstruct.render.relight import lit_share, relight
 
-NO_LIGHT = 1e-12  # squared radiance: a pixel that no photo lights has no albedo
-
 
 def photographed(view: RenderView, calibration: Calibration, photo: str) -> Float[Tensor, "height width 3"]:
     """Render the scene, linear, under all lights of one photo and the ambient light."""

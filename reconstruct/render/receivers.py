@@ -6,14 +6,11 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import conv2d, normalize
+from torch.nn.functional import normalize
 
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import visibility
 from reconstruct.sdf.shadow_rays import RAYS_PER_BATCH, SHARPNESS_PER_VOXEL
-
-NO_WEIGHT = 1e-6  # no pixel that is interpolated has less: the lattice's nearest node weighs at least 1 / every^2
-
 
 TURN_HASH = (12.9898, 78.233, 37.719)  # of a place, in voxels: neighbours get unrelated fractions
 
@@ -87,36 +84,3 @@ def across(
     second = torch.linalg.cross(axis, first)
     turn = 2 * math.pi * ((places @ torch.tensor(TURN_HASH)).sin() * 43758.5453).frac()[:, None]
     return turn.cos() * first + turn.sin() * second, turn.cos() * second - turn.sin() * first
-
-
-def lattice(surface: Bool[Tensor, "height width"], every: int) -> Bool[Tensor, "height width"]:
-    """Select the surface pixels in every `every`-th row and column, and those without a selected pixel nearby."""
-    if every == 1:
-        return surface
-    on = torch.zeros_like(surface)
-    on[::every, ::every] = surface[::every, ::every]
-    return surface & (on | (_tent(on[..., None].float(), every)[..., 0] == 0))
-
-
-def between(
-    values: Float[Tensor, "height width 3"],
-    known: Bool[Tensor, "height width"],
-    surface: Bool[Tensor, "height width"],
-    every: int,
-) -> Float[Tensor, "height width 3"]:
-    """Return the known values of a picture, and at other surface pixels values interpolated from its `lattice`."""
-    if every == 1:
-        return values
-    on = torch.zeros_like(known)
-    on[::every, ::every] = (known & surface)[::every, ::every]
-    weight = on[..., None].float()
-    blended = _tent(values * weight, every) / _tent(weight, every).clamp(min=NO_WEIGHT)
-    return torch.where(known[..., None], values, blended)
-
-
-def _tent(picture: Float[Tensor, "height width channels"], every: int) -> Float[Tensor, "height width channels"]:
-    """Sum over neighbours with weights that fall linearly to 0 at `every` pixels (linear interpolation)."""
-    fall = 1 - torch.arange(1 - every, every).abs() / every
-    channels = picture.shape[-1]
-    kernel = (fall[:, None] * fall).expand(channels, 1, -1, -1)
-    return conv2d(picture.permute(2, 0, 1)[None], kernel, padding=every - 1, groups=channels)[0].permute(1, 2, 0)

@@ -1,7 +1,6 @@
 """Relighting: pictures of a solved scene under new lights, with shadows and highlights.
 
-relight: one light without extent. relight_soft: a spherical lamp. environment: an environment map. The last two take
-many shadow rays per pixel; their `_steps` variants compute in small parts, so that a page stays responsive.
+relight: one light without extent. relight_soft: a spherical lamp. environment: an environment map.
 """
 
 import math
@@ -17,7 +16,7 @@ from calibration.light import Light, irradiance
 from reconstruct.appearance.brdf import reflectance, specular
 from reconstruct.render.environment import patches, sky_lights, sky_size
 from reconstruct.render.g_buffer import Interreflection, RenderView
-from reconstruct.render.receivers import Receivers, across, between, disc, lattice
+from reconstruct.render.receivers import Receivers, across, disc
 from reconstruct.sdf.shadow_rays import shadow_starts
 
 RAYS_PER_STEP = 2**18  # of an environment map: a tenth of a second
@@ -66,18 +65,6 @@ def relight_soft(
         samples: shadow rays per pixel.
         beam, ambient: as for `relight`.
     """
-    return last(relight_steps(view, light, radius, samples, beam, ambient))
-
-
-def relight_steps(
-    view: RenderView,
-    light: Light,
-    radius: float,
-    samples: int,
-    beam: tuple[float, ...] = (),
-    ambient: Float[np.ndarray, "3"] | None = None,
-) -> Iterator[Float[Tensor, "height width 3"] | None]:
-    """Compute `relight_soft` in parts: yield None after each sample, then the picture."""
     lit = torch.isfinite(view.maps.depth)
     everywhere = _pixels(view, lit)
     arriving = _unhidden(everywhere, light, beam)
@@ -91,12 +78,11 @@ def relight_steps(
         direct_sum += direct
         if view.gloss is not None:
             mirrored[partly] += _glossy(view, there, towards, direct)
-        yield None
     diffuse[partly] += direct_sum
     radiance = view.albedo[lit] * diffuse + mirrored
     if ambient is not None:
         radiance += view.albedo[lit] * torch.as_tensor(ambient, dtype=torch.float32)
-    yield _picture(lit, radiance)
+    return _picture(lit, radiance)
 
 
 def lit_share(view: RenderView, light: Light, radius: float = 0.0, samples: int = 1) -> Float[Tensor, "height width"]:
@@ -105,13 +91,6 @@ def lit_share(view: RenderView, light: Light, radius: float = 0.0, samples: int 
     share = sum(seen / samples for _, _, seen in _lamp_rays(_pixels(view, there), light, radius, samples))
     assert isinstance(share, Tensor)
     return _picture(there, share)
-
-
-def last(steps: Iterator[Tensor | None]) -> Tensor:
-    """Return the last value of a `_steps` function, its picture."""
-    *_, picture = steps
-    assert picture is not None
-    return picture
 
 
 def _picture(where: Bool[Tensor, "height width"], values: Shaped[Tensor, " n *channels"]) -> Tensor:
@@ -230,42 +209,24 @@ def environment(
         rows: elevation bands that a finer map is averaged to, even; the cost is rows^2 shadow rays per pixel.
         turn: rotation of the map about the vertical, rad, from +x towards +y.
     """
-    return last(environment_steps(view, radiance, rows, turn))
-
-
-def environment_steps(
-    view: RenderView, radiance: Float[Tensor, "rows columns 3"], rows: int = 16, turn: float = 0.0, every: int = 1
-) -> Iterator[Float[Tensor, "height width 3"] | None]:
-    """Compute `environment` in parts: yield None after every few directions, then the picture.
-
-    Args:
-        every: for a preview: light on the ground is computed at every `every`-th row and column and interpolated
-            between them; all object pixels are computed.
-    """
     directions, amount = sky_lights(radiance, rows, turn)
     patch = math.pi / sky_size(radiance, rows)[0]
     lit = torch.isfinite(view.maps.depth)
-    ground = lit & ~view.maps.mask
-    there = lit & (view.maps.mask | lattice(ground, every))
-    arrived = torch.zeros(int(there.sum()), 3)
-    mirrored = torch.zeros_like(arrived)
-    sent_on = torch.zeros(int(lit.sum()), 3)
+    arrived = torch.zeros(int(lit.sum()), 3)
+    mirrored, sent_on = torch.zeros_like(arrived), torch.zeros_like(arrived)
     if view.interreflection is not None:
         on_patches = torch.zeros_like(view.interreflection.patches.points)
         for _, power, share in _sky_rays(_patches(view, view.interreflection), directions, amount):
             on_patches += share.T @ power
-            yield None
         sent_on = view.interreflection.at_pixels(on_patches)
-    for some, power, share in _sky_rays(_pixels(view, there), directions, amount):
+    for some, power, share in _sky_rays(_pixels(view, lit), directions, amount):
         arrived += share.T @ power
         for direction, one, part in zip(some, power, share, strict=True) if view.gloss is not None else ():
-            mirrored += _glossy(view, there, direction.expand_as(arrived), part[:, None] * one, patch)
-        yield None
-    arrived, mirrored = (between(_picture(there, x), there, ground, every)[lit] for x in (arrived, mirrored))
+            mirrored += _glossy(view, lit, direction.expand_as(arrived), part[:, None] * one, patch)
     radiance_seen = view.albedo[lit] * (arrived + sent_on)
     if view.gloss is not None:
         radiance_seen += mirrored * _evenness(view, lit, sky_size(radiance, rows))
-    yield _picture(lit, radiance_seen)
+    return _picture(lit, radiance_seen)
 
 
 def _sky_rays(
