@@ -28,11 +28,10 @@ from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
 from reconstruct.run.presets import preset
 from reconstruct.scene import Scene
-from reconstruct.sdf.level_set import resampled
-from reconstruct.solve.backend import MovingSurface, backend_name, ray_passes, solver_device, surface_on
+from reconstruct.sdf.level_set import LevelSet, resampled
+from reconstruct.solve.backend import backend_name, solver_device
 from reconstruct.solve.operators import RayPasses
 from reconstruct.solve.solver import fit
-from reconstruct.torch_sdf.level_set import TorchLevelSet
 
 TIMED = 10  # iterations per level, after two to warm up
 SHARPNESS = 12.0  # per voxel, the middle of the solver's range
@@ -76,24 +75,23 @@ def compare_level(scene: Scene, device: torch.device, config: FitConfig, nodes: 
     start = begin.surface()
     [labels] = begin.labels(start, (scene,))
     kernel, rays = resampled(start, nodes), supervise(scene, labels)
-    moving = surface_on(device, resampled(start, nodes))
-    assert isinstance(moving, TorchLevelSet)
-    by_kernels = ray_passes(kernel, scene, rays, config)
-    by_torch = ray_passes(moving, scene, supervise(scene, labels), config)
+    moving = resampled(start, nodes).on(device)
+    by_kernels = RayPasses(kernel, scene, rays, config)
+    by_torch = RayPasses(moving, scene, supervise(scene, labels), config)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
     for surface, shoot in ((kernel, by_kernels), (moving, by_torch)):
         shoot.look(surface.grid(), scene, 0, SHARPNESS, 0.5)
         shoot(0, SHARPNESS)
     expected = kernel.sums()[0]
-    apart = np.linalg.norm(moving.sums()[0].cpu().numpy() - expected) / np.linalg.norm(expected)
+    apart = np.linalg.norm(moving.sums()[0] - expected) / np.linalg.norm(expected)
     before = kernel.phi.copy()
     for surface in (kernel, moving):
         surface.step(2, 0.4, 0.0, 0.0, 4, 0.1)
         surface.redistance()
     moved, step = np.abs(kernel.phi - before).mean(), np.abs(kernel.phi - moving.phi).mean()
 
-    def iterate(surface: MovingSurface, shoot: RayPasses) -> Callable[[int], object]:
+    def iterate(surface: LevelSet, shoot: RayPasses) -> Callable[[int], object]:
         def work(i: int) -> None:
             shoot(1 + i, SHARPNESS)
             surface.step(2, 0.1, 0.0, 0.0, 4, 0.1)

@@ -15,7 +15,7 @@ from reconstruct.sdf.blocks import Blocks, near_surface, overlapping, pack
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.kernels import SIDE
 from reconstruct.sdf.level_set import BAND, LevelSet, resampled
-from reconstruct.solve.backend import ray_passes
+from reconstruct.solve.operators import RayPasses
 
 SHAPE = (101, 67, 86)  # no side is a whole number of blocks
 CENTRE = np.array([50.0, 33.0, 40.0])
@@ -105,7 +105,7 @@ def test_a_solve_on_blocks_is_the_solve_on_the_whole_grid():
     on_all._keep(whole(on_all.phi))
     assert len(on_blocks.field.pool) < 0.7 * len(on_all.field.pool)
     for surface in (on_blocks, on_all):
-        shoot = ray_passes(surface, scene, supervise(scene, labels), FitConfig(rays=20_000))
+        shoot = RayPasses(surface, scene, supervise(scene, labels), FitConfig(rays=20_000))
         for i in range(8):
             shoot.look(surface.grid(), scene, i, 12.0, 0.5)
             shoot(i, 12.0)

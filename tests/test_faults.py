@@ -109,7 +109,7 @@ def test_a_gradient_that_is_no_number_is_found_even_if_the_errors_are(scene, mon
         losses = shoot(self, iteration, sharpness)
         steps.append(iteration)
         if len(steps) == 4:
-            self.operators.surface.g[0][0, 0, 0, 0] = np.nan
+            self.operators.surface.gathered[0, 0, 0] = np.nan
         return losses
 
     monkeypatch.setattr(RayPasses, "__call__", spoilt)

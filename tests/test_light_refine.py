@@ -16,18 +16,19 @@ from reconstruct.fields import load_fields, save_fields
 from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
-from reconstruct.sdf import kernels
-from reconstruct.sdf.blocks import overlapping, pack
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.level_set import LevelSet
 from reconstruct.solve import solver
 from reconstruct.solve.level import LevelFit
 from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift, unseen_motion
+from reconstruct.solve.ray_operators import cross_entropy
 from reconstruct.solve.solver import fit
 from reconstruct.solve.trials import judge, try_lights
 from reconstruct.source.calibrate_source import calibrate_source
 from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
 from reconstruct.source.source import open_source
+from reconstruct.torch_sdf.compiled import CompiledRays
 
 SMALL = FitConfig(levels=(Level(24, 30, (0.5, 0.4), 3, 5e-4), Level(40, 30, (0.4, 0.1), 2)), votes=1)
 RICH = FitConfig(levels=(Level(32, 40, (0.5, 0.4), 3, 5e-4), Level(48, 30, (0.4, 0.1), 2)), votes=1)
@@ -55,19 +56,16 @@ def misplaced(scene, relative: float, seed: int = 5):
 
 
 def shadow_loss(phi, origins, light, label):
-    """Sum over rays of the loss of shadow_pass, voxels, and the gradient it leaves for the light."""
-    n = len(origins)
-    length = np.linalg.norm(origins, axis=1)
-    view = (np.zeros(3), origins / length[:, None], length, 1e-3)
-    view += (np.full(n, 1e9), np.full(n, -1.0), np.zeros(n), np.full(n, kernels.EDGE, np.uint8))
-    batch = (np.stack([np.zeros(n, np.int64), np.arange(n)], 1), np.ones(n), np.zeros(n))
-    left = np.zeros((1, 4))
-    labels = np.full((1, n), label, np.float32)
-    field = overlapping(pack(phi))
-    grids = (field, np.zeros_like(field.pool), np.zeros_like(field.pool))
-    kernels.shadow_pass(*grids, left, 1e9, SHARPNESS, view, light[None], labels, batch, (0, 0, False, False), 0, n)
-    seen = np.abs(batch[2] - label)  # misses are |T - label|
-    return float(-np.log(seen if label == 1 else 1 - seen).sum() / SHARPNESS), left[0]
+    """Sum over rays of the loss of shadow rays, voxels, and the gradient it leaves for the light."""
+    rays = CompiledRays(LevelSet(phi, np.zeros(3), 1.0, is_distance=True))
+    lights = torch.tensor([[*light, 0.0]], dtype=torch.float64, requires_grad=True)
+    many = lights.expand(len(origins), 5)
+    seen, least = rays.march(torch.from_numpy(origins), many, SHARPNESS, torch.ones(len(origins), dtype=torch.float64))
+    target = torch.full_like(seen, float(label))
+    loss = cross_entropy(seen.exp(), -seen.expm1(), target).sum() / SHARPNESS + (1 - label) * least.sum()
+    loss.backward()
+    assert lights.grad is not None
+    return float(loss.detach()), lights.grad[0, [0, 1, 2, 4]].numpy()
 
 
 @pytest.mark.parametrize("light", [(40.0, 12.0, 70.0, 1.0), (0.48, 0.0, 0.8772, 0.0)])

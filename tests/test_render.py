@@ -7,10 +7,12 @@ from hypothesis import strategies as st
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
-from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import find_surface, first_hits, in_line_of_sight, run, visibility
+from reconstruct.solve.ray_operators import cross_entropy
 from reconstruct.torch_sdf import equations as render
+from reconstruct.torch_sdf.compiled import CompiledRays
 
 NODES, RADIUS = 40, 11.0
 CENTRE = torch.tensor([19.5, 19.5, 19.5])
@@ -129,30 +131,13 @@ def test_only_the_near_side_of_a_ball_is_in_line_of_sight():
 
 
 def kernel_gradient(grid: SdfGrid, starts: Tensor, ends: Tensor, label: float, sharpness: float) -> np.ndarray:
-    """d loss / d phi of shadow rays that start on bare "ground" at the end of short camera rays."""
-    phi = grid.blocks
-    g, c, light_g = np.zeros_like(phi.pool), np.zeros_like(phi.pool), np.zeros((len(ends), 4))
-    n = len(starts)
-    eye = np.zeros(3)
-    length = starts.norm(dim=-1).double().numpy()
-    view = (
-        eye,
-        starts.double().numpy() / length[:, None],
-        length,
-        1e-3,
-        np.full(n, 1e9),
-        np.full(n, -1.0),
-        np.zeros(n),
-        np.full(n, kernels.EDGE, np.uint8),
-    )
-    lights = np.concatenate([ends.double().numpy(), np.ones((n, 1))], 1)
-    drawn = np.stack([np.arange(n), np.arange(n)], 1)
-    batch = (drawn, np.ones(n), np.zeros(n))
-    labels = np.full((n, n), label, np.float32)
-    kernels.shadow_pass(
-        phi, g, c, light_g, 1e9, sharpness, view, lights, labels, batch, (0, 0, True, True), 0, n
-    )  # fmt: skip
-    return phi._replace(pool=g, far=0.0).dense()
+    """d loss / d phi of shadow rays, by the compiled operators."""
+    surface = LevelSet(grid.in_voxels(), np.zeros(3), 1.0, is_distance=True)
+    lights = torch.cat([ends.double(), torch.tensor([[1.0, 0.0]]).expand(len(ends), 2).double()], 1)
+    seen, _ = CompiledRays(surface).march(starts.double(), lights, sharpness, lights.new_ones(len(ends)))
+    target = torch.full_like(seen, label)
+    (cross_entropy(seen.exp(), -seen.expm1(), target).sum() / sharpness).backward()
+    return surface.sums()[0]
 
 
 def test_kernel_gradient_equals_autograd_through_dense_samples():
@@ -168,6 +153,7 @@ def test_kernel_gradient_equals_autograd_through_dense_samples():
         dense = render.transmittance(dense_sdf(SdfGrid(values, grid.origin, 1.0), starts, ends, 4000), sharpness)
         (render.shadow_loss(dense, torch.full_like(dense, label)).sum() / sharpness).backward()
         found = kernel_gradient(grid, starts, ends, label, sharpness)
+        assert values.grad is not None
         # The dense form spreads each extremum over its samples, so both are averaged over 3 nodes.
         expected, found = uniform_filter(values.grad.numpy(), 3), uniform_filter(found, 3)
         cosine = (expected * found).sum() / np.linalg.norm(expected) / np.linalg.norm(found)

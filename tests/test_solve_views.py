@@ -25,7 +25,7 @@ from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
 from reconstruct.shading import joint_normals
-from reconstruct.solve.backend import joint_passes, surface_on
+from reconstruct.solve.operators import JointPasses
 from reconstruct.solve.solver import fit
 
 SHAPES = (Sphere((0.0, 0.0, 30.0), 30.0, (0.7, 0.5, 0.3)), Sphere((12.0, 8.0, 60.0), 14.0, (0.3, 0.5, 0.7)))
@@ -225,12 +225,12 @@ def test_both_backends_add_up_the_same_gradient_of_several_views(views, solved):
     sums = []
     for device in (None, torch.device("cpu")):
         start = resampled(SdfGrid(solved.grid.values - 1.0, solved.grid.origin, solved.grid.spacing), 24)
-        surface = surface_on(device, start)
+        surface = start.on(device)
         rays = tuple(supervise(scene, own) for scene, own in zip(scenes, labels, strict=True))
-        shoot = joint_passes(surface, scenes, rays, QUICK)
+        shoot = JointPasses(surface, scenes, rays, QUICK)
         shoot.look(surface.grid(), scenes, 0, 8.0, 0.5)
         losses = shoot(0, 8.0)
-        sums.append((np.asarray(surface.sums()[0].tolist()), losses, shoot.light_gradient()))  # type: ignore[attr-defined]
+        sums.append((surface.sums()[0], losses, shoot.light_gradient()))
     (kernels, losses, lights), (ours, others, moved) = sums
     assert losses == pytest.approx(others, rel=1e-3)
     assert np.linalg.norm(kernels - ours) < 0.01 * np.linalg.norm(kernels)

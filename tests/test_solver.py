@@ -14,8 +14,8 @@ from reconstruct.labels.supervision import supervise
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import find_surface
 from reconstruct.solve import solver
-from reconstruct.solve.backend import ray_passes
 from reconstruct.solve.checkpoint import load_state
+from reconstruct.solve.operators import RayPasses
 from reconstruct.solve.solver import FitConfig, Level, fit
 
 pytestmark = pytest.mark.usefixtures("hull_start")
@@ -119,7 +119,7 @@ def test_the_true_surface_is_left_alone_by_its_own_shadows():
     phi = (np.linalg.norm(nodes - np.array(BALL.centre), axis=-1) - BALL.radius) / spacing
     surface = LevelSet(phi.astype(np.float32), origin, spacing)
     rays = supervise(scene, assemble_labels(scene, None, None))
-    shoot = ray_passes(surface, scene, rays, FitConfig(rays=20_000))
+    shoot = RayPasses(surface, scene, rays, FitConfig(rays=20_000))
     for i in range(40):
         if i % 5 == 0:
             shoot.look(surface.grid(), scene, i, 8.0, 0.5)

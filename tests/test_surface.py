@@ -47,8 +47,7 @@ def test_values_beyond_the_band_are_cut_to_it():
 def test_no_node_moves_further_than_the_rate():
     surface = level_set(ball(15))
     before = surface.phi.copy()
-    surface.g[0][...] = 5.0
-    surface.c[0][...] = 5.0
+    surface.gathered[0] = 5.0
     surface.step(passes=1, rate=0.3, shrink=0.0, curvature=0.0, stiffness=0, smoothing=0.0)
     moved = before - surface.phi
     assert moved.max() <= 0.3 + 1e-5

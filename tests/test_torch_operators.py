@@ -1,4 +1,4 @@
-"""The solver's operators in torch against those of the kernels: the same extrema, gradients, steps and surfaces."""
+"""Marching and scattering by plain torch against the compiled kernels, and whole solves by either."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,19 +16,16 @@ from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import Supervision, supervise
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
-from reconstruct.sdf.block_kernels import fill
 from reconstruct.sdf.blocks import overlapping, pack
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.level_set import LevelSet, redistanced
+from reconstruct.sdf.level_set import BAND, LevelSet
 from reconstruct.solve import solver
-from reconstruct.solve.backend import solver_device, surface_on
-from reconstruct.solve.kernel_operators import KernelOperators
+from reconstruct.solve.backend import solver_device
 from reconstruct.solve.operators import RayPasses
+from reconstruct.solve.ray_operators import RayOperators
 from reconstruct.solve.solver import fit
-from reconstruct.solve.torch_operators import TorchOperators
 from reconstruct.torch_sdf import rays as torch_march
-from reconstruct.torch_sdf.level_set import TorchLevelSet
-from reconstruct.torch_sdf.level_set import redistanced as torch_redistanced
+from reconstruct.torch_sdf.ray_field import ray_field
 from reconstruct.torch_sdf.rays import MISSED, extrema, first_surface, towards
 from reconstruct.torch_sdf.volume import Volume
 
@@ -107,27 +104,46 @@ def cosine(found: np.ndarray, expected: np.ndarray) -> float:
     return float((found * expected).sum() / np.linalg.norm(found) / np.linalg.norm(expected))
 
 
-def operators_of(setting, device: str, real: torch.dtype) -> tuple[RayPasses, RayPasses]:
-    """The same surface under the same rays: through torch, and through the kernels."""
-    state, scene, labels = setting
-    moving = TorchLevelSet(torch.from_numpy(state.phi).to(device), state.origin, state.spacing, is_distance=True)
-    kernel = LevelSet(state.phi.copy(), state.origin, state.spacing, is_distance=True)
-    ours, theirs = labels(), labels()
-    return (
-        RayPasses(TorchOperators(moving, scene, ours, SMALL, real), scene, ours, SMALL),
-        RayPasses(KernelOperators(kernel, scene, theirs, SMALL), scene, theirs, SMALL),
-    )
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("sharpness", [4.0, 25.0])
+def test_marching_and_scattering_are_the_kernels(device, sharpness):
+    starts, ends = random_ends(4000)
+    rng, sums, found = np.random.default_rng(1), [], []
+    jitter, upstream = rng.uniform(0.5, 1, 4000), rng.normal(0, 1, 4000)
+    ends[::3] /= np.linalg.norm(ends[::3], axis=1, keepdims=True)  # directions
+    lights = np.concatenate([ends, (np.arange(4000) % 3 > 0)[:, None], np.zeros((4000, 1))], 1)
+    for where in (None, torch.device(device)):
+        surface = LevelSet(two_balls(), np.zeros(3), 1.0, device=where)
+        rays, there = ray_field(surface), surface.values.device
+        given = [torch.from_numpy(x).to(there) for x in (starts, lights, jitter, upstream)]
+        points, towards = (x.to(rays.real).requires_grad_() for x in given[:2])
+        seen, least = rays.march(points, towards, sharpness, given[2].to(rays.real))
+        least = torch.where(least < BAND - 1e-3, least, 0.0)  # at the band, rounding decides
+        loss = torch.where(seen > -20, seen, 0.0) + least + rays.sample(points.detach())
+        (loss @ given[3].to(rays.real)).backward()
+        assert points.grad is not None and towards.grad is not None
+        found.append([x.detach().cpu().numpy() for x in (seen.exp(), least, points.grad, towards.grad)])
+        sums.append(surface.sums())
+    assert 0.05 < (found[0][0] < 0.5).mean() < 0.9 and np.abs(found[0][1]).max() > 0.1
+    for mine, theirs in zip((*found[1], *sums[1]), (*found[0], *sums[0]), strict=True):
+        apart = np.abs(mine - theirs)
+        assert np.abs(theirs).max() > 0.1
+        assert np.quantile(apart, 0.99) < 1e-3 * np.abs(theirs).max()
+        assert cosine(mine, theirs) > 0.999
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("real", "tolerance"), [(torch.float64, 1e-5), (torch.float32, 5e-3)])
 @pytest.mark.parametrize("sharpness", [4.0, 25.0])
-def test_an_iteration_has_the_kernels_errors_and_gradients(setting, device, real, tolerance, sharpness):
+def test_an_iteration_has_the_kernels_errors_and_gradients(setting, device, sharpness):
     # A ray along a ridge or a valley of the SDF has its extremum anywhere on it, and where the SDF falls by next to
     # nothing, 1 / (1 - T) is large: float32 knows neither well. That is a ray or two, on some tens of nodes.
-    by_torch, by_kernels = operators_of(setting, device, real)
-    for passes in (by_torch, by_kernels):
-        passes.look(passes.operators.surface.grid(), setting[1], 0, sharpness, 1.0)
+    state, scene, labels = setting
+    every = [state.on(torch.device(device)), state.on(None)]
+    by_torch, by_kernels = (RayPasses(surface, scene, labels(), SMALL) for surface in every)
+    tolerance = 1e-5 if device == "cpu" else 5e-3
+    for passes, surface in zip((by_torch, by_kernels), every, strict=True):
+        surface.forget()
+        passes.look(surface.grid(), scene, 0, sharpness, 1.0)
     for iteration in range(2):
         found, expected = by_torch(iteration, sharpness), by_kernels(iteration, sharpness)
         assert found == pytest.approx(expected, rel=1e-4)
@@ -135,66 +151,19 @@ def test_an_iteration_has_the_kernels_errors_and_gradients(setting, device, real
     np.testing.assert_allclose(by_torch.shadow_rays.misses, by_kernels.shadow_rays.misses, atol=tolerance)
     np.testing.assert_array_equal(by_torch.shadow_rays.places, by_kernels.shadow_rays.places)
     assert (by_torch.rays.wrong != by_kernels.rays.wrong).mean() < 1e-3
-    sums = (x.operators.surface.sums() for x in (by_torch, by_kernels))
-    for mine, theirs in zip(*sums, strict=True):
-        apart = np.abs(mine.cpu().numpy() - theirs)
-        assert real == torch.float32 or np.linalg.norm(apart) < tolerance * np.linalg.norm(theirs)
-        assert cosine(mine.cpu().numpy(), theirs.astype(np.float64)) > 0.9999
+    for mine, theirs in zip(*(surface.sums() for surface in every), strict=True):
+        apart = np.abs(mine - theirs)
+        assert cosine(mine.astype(np.float64), theirs.astype(np.float64)) > 0.9999
         assert np.quantile(apart[theirs != 0], 0.98) < 1e-4 * np.abs(theirs).max()
     mine, theirs = (x.operators.light_gradient() for x in (by_torch, by_kernels))
     assert cosine(mine, theirs) > 0.99
     np.testing.assert_allclose(mine, theirs, atol=10 * tolerance * np.abs(theirs).max())
-
-
-OPERATORS = {
-    "shadow": lambda passes, s: passes.operators.shadow(passes.shadow_rays, 0, s),
-    "mask": lambda passes, s: passes.operators.mask(passes.camera_rays, 0, s),
-    "normal": lambda passes, s: passes.operators.normal(),
-}
-
-
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("name", OPERATORS)
-def test_each_operator_alone_has_the_kernels_value_and_gradient(setting, device, name):
-    by_torch, by_kernels = operators_of(setting, device, torch.float32)
-    sides = []
-    for passes in (by_torch, by_kernels):
-        passes.look(passes.operators.surface.grid(), setting[1], 0, 12.0, 1.0)
-        passes(0, 12.0)
-        passes.operators.surface.forget()
-        value = OPERATORS[name](passes, 12.0)
-        sides.append((value, np.asarray(passes.operators.surface.sums()[0].tolist())))
-    (value, gradient), (expected, theirs) = sides
-    assert value == pytest.approx(expected, rel=1e-4)
-    assert cosine(gradient, theirs) > 0.99
-    assert np.linalg.norm(gradient) == pytest.approx(np.linalg.norm(theirs), rel=0.01)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_a_step_moves_the_surface_as_on_the_cpu(setting, device):
-    phi = redistanced(pack(two_balls())).dense()
-    kernel = LevelSet(phi.copy(), np.zeros(3), 1.0, is_distance=True)
-    moving = TorchLevelSet(torch.from_numpy(phi.copy()).to(device), np.zeros(3), 1.0, is_distance=True)
-    rng = np.random.default_rng(2)
-    points, amounts = torch.from_numpy(rng.uniform(0, NODES, (5000, 3))), torch.from_numpy(rng.normal(0.2, 1, 5000))
-    (moving.differentiable(torch.float64).sample(points.to(device)) * amounts.to(device)).sum().backward()
-    for part, total in zip((kernel.g[0], kernel.c[0]), moving.sums(), strict=True):
-        fill(total.float().cpu().numpy(), kernel.field.layout, part)
-    for level_set in (kernel, moving):
-        level_set.step(3, 0.4, 5e-4, 0.25, 4, 0.1)
-    assert np.abs(kernel.phi - phi).max() > 0.1
-    np.testing.assert_allclose(moving.phi, kernel.phi, atol=2e-5)
-    assert not moving.sums().any()
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_redistancing_ends_where_the_sweeps_do(device):
-    axis = np.arange(NODES)
-    x, y, z = np.meshgrid(axis, axis, axis - 4, indexing="ij")
-    box = np.maximum(np.maximum(np.abs(x - 20), np.abs(y - 21)), np.abs(z)) - 9.3  # cut by the lower face of the grid
-    phi = np.minimum(box * (1 + 0.3 * np.sin(x / 3)), 3 * two_balls()).astype(np.float32)
-    found = torch_redistanced(torch.from_numpy(phi).to(device)).cpu().numpy()
-    np.testing.assert_allclose(found, redistanced(pack(phi)).dense(), atol=1e-3)
+    before = [surface.phi for surface in every]
+    for surface in every:
+        surface.step(3, 0.4, 5e-4, 0.25, 4, 0.1)
+        surface.redistance()
+    assert np.abs(every[1].phi - before[1]).max() > 0.1
+    assert np.abs(every[0].phi - every[1].phi).mean() < 1e-4
 
 
 @pytest.fixture(scope="module")
@@ -261,7 +230,7 @@ def test_a_stopped_solve_is_continued_by_the_other_backend(ways, shadows, by_ker
 
 def without_memory(monkeypatch, calls: range) -> list[int]:
     """Those calls of the shadow pass find no memory; the rays at once of every call are listed."""
-    had, whole = [], TorchOperators._shadow_batch
+    had, whole = [], RayOperators._shadow_batch
     monkeypatch.setattr(torch_march.BATCHES, "rays", torch_march.MOST_RAYS)
 
     def short(self, *args):
@@ -271,7 +240,7 @@ def without_memory(monkeypatch, calls: range) -> list[int]:
             raise torch.OutOfMemoryError
         return whole(self, *args)
 
-    monkeypatch.setattr(TorchOperators, "_shadow_batch", short)
+    monkeypatch.setattr(RayOperators, "_shadow_batch", short)
     return had
 
 
@@ -299,8 +268,8 @@ def test_the_device_is_chosen_by_name():
     assert solver_device("torch-cpu") == torch.device("cpu")
     assert solver_device("auto") is None  # also beside a card, until one has passed benchmarks/run_gpu.py
     level_set = LevelSet(two_balls(), np.zeros(3), 1.0)
-    assert surface_on(None, level_set) is level_set
-    assert isinstance(surface_on(torch.device("cpu"), level_set), TorchLevelSet)
+    assert level_set.on(None) is level_set
+    assert level_set.on(torch.device("cpu")).device == torch.device("cpu")
 
 
 @pytest.mark.skipif(not torch.backends.mps.is_available(), reason="torch sees no MPS device")

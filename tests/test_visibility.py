@@ -1,14 +1,20 @@
 """Differentiable visibility against finite differences, dense sampling by autograd, and the solver's kernels."""
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from reconstruct.config import FitConfig
+from reconstruct.labels.supervision import Supervision
+from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
-from reconstruct.sdf.blocks import overlapping, pack
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import find_surface, visibility
+from reconstruct.solve.ray_operators import DrawnRays, RayOperators
 from reconstruct.torch_sdf import equations as render
 from reconstruct.torch_sdf.autograd import FirstIntersection, ShadowRenderer, transmittance
 
@@ -157,25 +163,23 @@ def test_the_renderer_is_the_solvers_shadow_pass_in_value_and_gradient():
     loss = render.shadow_loss(seen.visibility, label)[kept].sum() / (s * SPACING)
     (of_values,) = torch.autograd.grad(loss, values)
 
-    phi = overlapping(pack(np.ascontiguousarray(grid.values.numpy() / SPACING, np.float32)))
-    g, c, light_g = np.zeros_like(phi.pool), np.zeros_like(phi.pool), np.zeros((1, 4))
-    in_grid = ((eye - ORIGIN) / SPACING).numpy()
-    end = np.where(ground_t.isfinite(), ground_t / SPACING, 1e9)
-    hit, part_t, part_f = np.empty(n), np.empty(n), np.empty(n)
-    kernels.camera_pass(phi, in_grid, directions.numpy(), end, angle, hit, part_t, part_f, 0, n)
-    view = (in_grid, directions.numpy(), end, angle, hit, part_t, part_f, np.full(n, kernels.EDGE, np.uint8))
-    lights = np.concatenate([((light[:3] - ORIGIN) / SPACING).numpy(), [1.0]])[None]
-    drawn, misses = np.stack([np.zeros(n, np.int64), np.arange(n)], 1), np.zeros(n)
-    labels = np.full((1, n), 0.6, np.float32)
-    batch = (drawn, kept.double().numpy(), misses)
-    kernels.shadow_pass(
-        phi, g, c, light_g, 1e9, s * SPACING, view, lights, labels, batch, (0, 0, True, True), 0, n
+    nothing, none = np.zeros(n, np.float32), np.zeros((n, 3), np.float32)
+    rays = Supervision(
+        np.arange(n), directions.numpy(), ground_t.numpy(), np.full((1, n), 0.6, np.float32), nothing[None] + 1,
+        np.full(n, kernels.EDGE, np.uint8), nothing, nothing, none, nothing, np.zeros((1, n), np.uint8),
     )  # fmt: skip
+    surface = LevelSet(grid.in_voxels(), ORIGIN.numpy(), SPACING, is_distance=True)
+    scene = Mock(spec=Scene, eye=eye, lights=light[None], pixel_angle=angle)
+    operators = RayOperators(surface, scene, rays, FitConfig())
+    operators.find_surface()
+    drawn = DrawnRays(np.stack([np.zeros(n, np.int64), np.arange(n)], 1), kept.double().numpy(), np.zeros(n))
+    operators.shadow(drawn, 0, s * SPACING)
+    misses = drawn.misses
     found = seen.visibility.detach()[kept]
     # The kernels take a random share of the first step, so minima are refined from other samples.
     np.testing.assert_allclose((found - 0.6).abs().numpy(), misses[kept.numpy()], atol=0.02)
     mine = of_values.numpy() * SPACING
-    theirs = phi._replace(pool=g, far=0.0).dense()
+    theirs = surface.sums()[0]
     cosine = (mine * theirs).sum() / np.linalg.norm(mine) / np.linalg.norm(theirs)
     assert cosine > 0.97, cosine
 

@@ -93,7 +93,7 @@ class SdfGrid:
         tensors = (points, self.values)
         if all(x.device.type == "cpu" and x.dtype == torch.float32 and not x.requires_grad for x in tensors):
             places, out = (points.double() - self.origin.double()) / self.spacing, torch.empty_like(points)
-            gradients(self.blocks, np.ascontiguousarray(places.numpy()), step, out.numpy())
+            gradients(self.blocks, np.ascontiguousarray(places.numpy()), step, out.numpy(), 0, len(points))
             return out
         offsets = step * self.spacing * torch.eye(3, dtype=points.dtype, device=points.device)
         differences = [self.sdf(points + offset) - self.sdf(points - offset) for offset in offsets]

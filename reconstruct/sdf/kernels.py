@@ -106,9 +106,9 @@ def _extended(phi, x, y, z):
 
 
 @njit(**UNCOUNTED)
-def gradients(phi, points, h, out):
-    """Write the SDF's gradient at points to out, float32: central differences over h voxels each way."""
-    for r in range(len(points)):
+def gradients(phi, points, h, out, start, stop):
+    """Write the SDF's gradient at points to out: central differences over h voxels each way."""
+    for r in range(start, stop):
         x, y, z = points[r, 0], points[r, 1], points[r, 2]
         out[r, 0] = (_extended(phi, x + h, y, z) - _extended(phi, x - h, y, z)) / (2 * h)
         out[r, 1] = (_extended(phi, x, y + h, z) - _extended(phi, x, y - h, z)) / (2 * h)
@@ -116,8 +116,8 @@ def gradients(phi, points, h, out):
 
 
 @njit(**INNER)
-def _scatter(phi, g, c, band, x, y, z, amount):
-    """Add amount times the trilinear weights to g, and its absolute value to c, on nodes within the band."""
+def _scatter(phi, sums, band, x, y, z, amount):
+    """Add amount times the trilinear weights, and its absolute value, to the sums of nodes within the band."""
     index, pool, nodes, _ = phi
     i, j, k, u, v, w = _cell(nodes, x, y, z)
     size = abs(amount)
@@ -130,8 +130,8 @@ def _scatter(phi, g, c, band, x, y, z, amount):
                 p, q, r = (i + di) & WITHIN, (j + dj) & WITHIN, (k + dk) & WITHIN
                 if block >= 0 and abs(pool[block, p, q, r]) < band:
                     weight = wi * wj * (w if dk else 1 - w)
-                    g[block, p, q, r] += weight * amount
-                    c[block, p, q, r] += weight * size
+                    sums[block, p, q, r, 0] += weight * amount
+                    sums[block, p, q, r, 1] += weight * size
 
 
 @njit(forceinline=True, **INNER)
@@ -385,6 +385,7 @@ def uniforms(seed, a, step, out, start, stop):
 
 EDGE, GROUND, OBJECT = 0, 1, 2  # content of a pixel: both or unknown, surely ground, surely object
 GRAZING = 0.15  # cosine below which the intersection's derivative along the ray is too large
+LEAST_SLOPE = 1e-6  # of the loss by the SDF at a point: less is not spread over the nodes
 MAX_START = 2.0  # bound of the start-point gradient, voxels
 WRONG = 0.5  # |T - label| above which a ray contradicts its label
 PATIENCE = 6.0  # contradictions after which a ray's weight is halved
@@ -393,208 +394,76 @@ TURNS = 16  # sets of random numbers per iteration
 JITTER, MASK_JITTER = 9, 12  # which of them: first steps of shadow rays, and of camera rays
 
 
-@njit(forceinline=True, **INNER)
-def _loss_slope(transmitted, target):
-    """Return dL/dT of L = -y log T - (1 - y) log(1 - T), clamped to be finite at both ends."""
-    t = min(max(transmitted, 1e-9), 1 - 1e-9)
-    return (1 - target) / (1 - t) - target / t
-
-
-@njit(**INNER)
-def _scatter_ray(phi, g, c, band, s, amount, n, lows, highs, origin, ray, back, light):
-    """Scatter amount * dlogT/dphi / s along one ray; add d/d start to back[0:3] and d/d light to light[0:4].
-
-    A point light's gradient is by its position, a directional one's by its direction.
-
-    Args:
-        lows, highs: (t, value) rows of the minima and maxima; origin (3,); ray: direction and length.
-    """
-    for m in range(n):
-        for at_top in range(2):
-            t = highs[m, 0] if at_top else lows[m, 0]
-            f = highs[m, 1] if at_top else lows[m, 1]
-            part = amount * (-_phi_of(-s * f) if at_top else _phi_of(-s * f))
-            if abs(part) < 1e-6 or (at_top and t <= 0):
-                continue
-            x, y, z = origin[0] + t * ray[0], origin[1] + t * ray[1], origin[2] + t * ray[2]
-            _scatter(phi, g, c, band, x, y, z, part)
-            gx, gy, gz = _gradient(phi, x, y, z)
-            along = t / ray[3] if ray[3] < FAR else t  # this point's shift if the light moves by 1
-            rest = 1 - along if ray[3] < FAR else 1.0
-            back[0] += part * gx * rest
-            back[1] += part * gy * rest
-            back[2] += part * gz * rest
-            light[0] += part * gx * along
-            light[1] += part * gy * along
-            light[2] += part * gz * along
-            light[3] += abs(part) * along
-
-
-@njit(**INNER)
-def _start_gradient(phi, g, c, band, origin, view, back):
-    """Scatter the start's gradient: phi there moves it along the camera ray [ShadowNeuS eq:diff_intersect]."""
-    nx, ny, nz = _gradient(phi, origin[0], origin[1], origin[2])
-    facing = nx * view[0] + ny * view[1] + nz * view[2]
-    if facing > -GRAZING:
-        return
-    amount = -(back[0] * view[0] + back[1] * view[1] + back[2] * view[2]) / facing
-    _scatter(phi, g, c, band, origin[0], origin[1], origin[2], min(max(amount, -MAX_START), MAX_START))
-
-
-@njit(**INNER)
-def _trace(phi, s, jitter, origin, lights, k, ray, lows, highs, best):
-    """March from origin to light k; store ray (direction, length), extrema and best (t, value); return n and T."""
-    ray[0], ray[1], ray[2], ray[3] = _towards(lights, k, origin[0], origin[1], origin[2])
-    n, log_t, best[0], best[1] = _extrema(
-        phi, origin[0], origin[1], origin[2], ray[0], ray[1], ray[2], 0.0, ray[3], s, jitter, lows, highs
-    )
-    return n, math.exp(log_t)
-
-
-@njit(**INNER)
-def _backward(phi, g, c, band, s, slope, y, n, seen, weight, lows, highs, best, origin, ray, back, light):
-    """Scatter the gradient of one of a pixel's rays.
-
-    Args:
-        slope: d loss / d T of this ray; y: label; seen: T.
-    """
-    back[0], back[1], back[2] = 0.0, 0.0, 0.0
-    amount, count = weight * slope * seen, n
-    if n == 0 and y < 1 and best[0] > 0 and best[1] < band:
-        # T = 1 to rounding: T / (1 - T) * Phi(-s m) tends to 1 at the global minimum.
-        lows[0, 0], lows[0, 1] = best[0], -1e3 / s
-        highs[0, 0] = 0.0
-        amount, count = weight * (1 - y), 1
-    if count > 0:
-        _scatter_ray(phi, g, c, band, s, amount, count, lows, highs, origin, ray, back, light)
-
-
-@njit(forceinline=True, **INNER)
-def _facing(phi, origin, ray):
-    """Return the cosine between the surface's normal at a point and a ray's direction."""
-    nx, ny, nz = _gradient(phi, origin[0], origin[1], origin[2])
-    along = nx * ray[0] + ny * ray[1] + nz * ray[2]
-    return along / max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-9)
-
-
-@njit(**FAST)
-def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting, start, stop):
-    """Cast shadow rays start .. stop - 1 of a batch; add the loss's gradient to the grid and the lights.
-
-    A boundary pixel mixes two rays, C = w T_near + (1 - w) T_far [ShadowNeuS eq:edge_vis], w = 1/2 - m / footprint.
-
-    Args:
-        view: eye, directions, ground_t, width, hit, part_t, part_f of the camera pass, role. Rays of GROUND pixels
-            start on the ground even behind the surface; OBJECT pixels that miss the surface have no ray.
-        lights: homogeneous; label: visibility (photos, pixels).
-        batch: photos and pixels, weights; misses: filled with |C - label|, -1 where the pixel shows no surface.
-        setting: seed, iteration, use_boundary, use_start.
-
-    Returns: sum of weight * |C - label|, and the sum of weights.
-    """
-    lows, highs = np.empty((2, MAX_MINIMA, 2)), np.empty((2, MAX_MINIMA, 2))
-    origin, ray, best, back = np.zeros((2, 3)), np.zeros((2, 4)), np.zeros((2, 2)), np.zeros(3)
-    found = (lows, highs, origin, ray, best, back, np.zeros(2, np.int64), np.zeros(2), np.zeros(2))
-    return _shadow_rays(phi, g, c, light_g, band, s, view, lights, label, batch, setting, found, start, stop)
-
-
-@njit(**INNER)
-def _shadow_rays(phi, g, c, light_g, band, s, view, lights, label, batch, setting, found, start, stop):
-    """Do the work of shadow_pass; `found` are the arrays for what is known of a pixel's two rays."""
-    eye, directions, ground_t, width, hit, part_t, part_f, role = view
-    drawn, ray_weights, misses = batch
-    seed, iteration, use_boundary, use_start = setting
-    lows, highs, origin, ray, best, back, count, seen, share = found
-    total, weights = 0.0, 0.0
+@njit(**UNCOUNTED)
+def samples(phi, points, out, start, stop):
+    """Write the SDF at points to out."""
     for r in range(start, stop):
-        k, p, weight = drawn[r, 0], drawn[r, 1], ray_weights[r]
-        misses[r] = -1.0
-        is_hit = hit[p] < FAR and role[p] != GROUND
-        end = hit[p] if is_hit else ground_t[p]
-        if weight < NO_WEIGHT or end > FAR or (role[p] == OBJECT and not is_hit):
-            continue
-        share[0], share[1], footprint, starts = 1.0, 0.0, 1.0, 1
-        if use_boundary and part_t[p] > 0 and role[p] != GROUND:
-            footprint, starts = width * part_t[p], 2
-            share[1] = min(max(0.5 - part_f[p] / footprint, 0.0), 1.0)
-            share[0] = 1 - share[1]
-        seen[1] = 0.0
-        for e in range(starts):
-            for a in range(3):
-                origin[e, a] = eye[a] + (part_t[p] if e else end) * directions[p, a]
-            jitter = 0.5 + 0.5 * hash_uniform(seed, iteration * TURNS + JITTER, 3 * r + e)
-            count[e], seen[e] = _trace(phi, s, jitter, origin[e], lights, k, ray[e], lows[e], highs[e], best[e])
-        y = label[k, p]
-        # A surface that faces away is dark by max(n . l, 0); its ray would pass a thin slice only and make a bulge.
-        if y < 0.5 and is_hit and _facing(phi, origin[0], ray[0]) < 0:
-            seen[0], count[0] = 0.0, 1
-        blend = share[0] * seen[0] + share[1] * seen[1]
-        misses[r] = abs(blend - y)
-        total += weight * misses[r]
-        weights += weight
-        slope = _loss_slope(blend, y)
-        for e in range(starts):
-            if share[e] > 1e-3:
-                _backward(
-                    phi, g, c, band, s, slope * share[e], y, count[e], seen[e], weight,
-                    lows[e], highs[e], best[e], origin[e], ray[e], back, light_g[k],
-                )  # fmt: skip
-                if use_start and e == 0 and is_hit:
-                    _start_gradient(phi, g, c, band, origin[e], directions[p], back)
-        if starts == 2:
-            amount = -slope * (seen[1] - seen[0]) / (footprint * s)
-            _scatter(phi, g, c, band, origin[1, 0], origin[1, 1], origin[1, 2], weight * min(max(amount, -1.0), 1.0))
-    return total, weights
-
-
-@njit(**FAST)
-def mask_pass(phi, g, c, band, s, view, mask, batch, setting, start, stop):
-    """Treat camera rays as shadow rays: the camera is one more light, which reaches the pixels of bare ground.
-
-    Args:
-        view, setting: as in shadow_pass; mask: object coverage, (pixels,); batch: pixels and weights of the rays.
-    """
-    eye, directions, ground_t = view
-    seed, iteration = setting
-    lows, highs = np.empty((MAX_MINIMA, 2)), np.empty((MAX_MINIMA, 2))
-    best, back, unused, ray = np.zeros(2), np.zeros(3), np.zeros(4), np.zeros(4)
-    total, weights = 0.0, 0.0
-    chosen, ray_weights = batch
-    for r in range(start, stop):
-        p, weight = chosen[r], ray_weights[r]
-        ray[0], ray[1], ray[2], ray[3] = directions[p, 0], directions[p, 1], directions[p, 2], FAR
-        jitter = 0.5 + 0.5 * hash_uniform(seed, iteration * TURNS + MASK_JITTER, r)
-        n, log_t, best[0], best[1] = _extrema(
-            phi, eye[0], eye[1], eye[2], ray[0], ray[1], ray[2], 0.0, ground_t[p], s, jitter, lows, highs
-        )
-        seen, y = math.exp(log_t), 1 - mask[p]
-        total += weight * abs(seen - y)
-        weights += weight
-        slope = _loss_slope(seen, y)
-        _backward(phi, g, c, band, s, slope, y, n, seen, weight, lows, highs, best, eye, ray, back, unused)
-    return total, weights
+        out[r] = _sample(phi, points[r, 0], points[r, 1], points[r, 2])
 
 
 @njit(**UNCOUNTED)
-def normal_pass(phi, g, c, band, view, normals, confidence, start, stop):
-    """Add the gradient of half the squared distance between a pixel's normal and the SDF's gradient at its hit."""
-    eye, directions, hit = view
-    total, weights = 0.0, 0.0
-    for p in range(start, stop):
-        weight = confidence[p]
-        if weight < NO_WEIGHT or hit[p] > FAR:
-            continue
-        x = eye[0] + hit[p] * directions[p, 0]
-        y = eye[1] + hit[p] * directions[p, 1]
-        z = eye[2] + hit[p] * directions[p, 2]
-        gx, gy, gz = _gradient(phi, x, y, z)
-        rx, ry, rz = gx - normals[p, 0], gy - normals[p, 1], gz - normals[p, 2]
-        _scatter(phi, g, c, band, x + 0.5, y, z, weight * rx)
-        _scatter(phi, g, c, band, x - 0.5, y, z, -weight * rx)
-        _scatter(phi, g, c, band, x, y + 0.5, z, weight * ry)
-        _scatter(phi, g, c, band, x, y - 0.5, z, -weight * ry)
-        _scatter(phi, g, c, band, x, y, z + 0.5, weight * rz)
-        _scatter(phi, g, c, band, x, y, z - 0.5, -weight * rz)
-        total += weight * (rx * rx + ry * ry + rz * rz)
-        weights += weight
-    return total, weights
+def scatter(phi, sums, band, points, amounts, start, stop):
+    """Spread each amount over the nodes around its point: the adjoint of `samples`."""
+    for r in range(start, stop):
+        _scatter(phi, sums, band, points[r, 0], points[r, 1], points[r, 2], amounts[r])
+
+
+@njit(**UNCOUNTED)
+def march(phi, origins, lights, far, s, jitter, rays, found, start, stop):
+    """March rays to their homogeneous lights, or as far as `far`, and keep their extrema.
+
+    Args:
+        rays: filled with direction and length; found: with the number of minima, log T, parameter and value of the
+            least SDF, and rows of (t, value) of the minima and of the maxima before them.
+    """
+    count, log_t, best, lows, highs = found
+    for r in range(start, stop):
+        x, y, z = origins[r, 0], origins[r, 1], origins[r, 2]
+        dx, dy, dz, length = _towards(lights, r, x, y, z)
+        rays[r, 0], rays[r, 1], rays[r, 2], rays[r, 3] = dx, dy, dz, length
+        count[r], log_t[r], best[r, 0], best[r, 1] = _extrema(
+            phi, x, y, z, dx, dy, dz, 0.0, min(length, far[r]), s, jitter[r], lows[r], highs[r]
+        )
+
+
+@njit(**INNER)
+def _scatter_extremum(phi, sums, band, origin, ray, t, part, back, light):
+    """Scatter the slope `part` at one point of a ray; add what moves the ray's start to back, and its light to light.
+
+    A point light's gradient is by its position, a directional one's by its direction; light[4] gets |part|.
+    """
+    x, y, z = origin[0] + t * ray[0], origin[1] + t * ray[1], origin[2] + t * ray[2]
+    _scatter(phi, sums, band, x, y, z, part)
+    gx, gy, gz = _gradient(phi, x, y, z)
+    along = t / ray[3] if ray[3] < FAR else t  # this point's shift if the light moves by 1
+    rest = 1 - along if ray[3] < FAR else 1.0
+    back[0] += part * gx * rest
+    back[1] += part * gy * rest
+    back[2] += part * gz * rest
+    light[0] += part * gx * along
+    light[1] += part * gy * along
+    light[2] += part * gz * along
+    light[4] += abs(part) * along
+
+
+@njit(**UNCOUNTED)
+def scatter_march(phi, sums, band, s, of_log, of_least, origins, rays, found, back, light, start, stop):
+    """Scatter the gradient of marched rays, given d loss / d log T and, of rays without minima, d loss / d least SDF.
+
+    back and light get the gradients by a ray's start and its light, see _scatter_extremum.
+    """
+    count, _, best, lows, highs = found
+    for r in range(start, stop):
+        for a in range(3):
+            back[r, a] = 0.0
+        for a in range(5):
+            light[r, a] = 0.0
+        if count[r] == 0 and of_least[r] != 0:
+            _scatter_extremum(phi, sums, band, origins[r], rays[r], best[r, 0], of_least[r], back[r], light[r])
+        for m in range(count[r]):
+            low = of_log[r] * s * _phi_of(-s * lows[r, m, 1])
+            if not abs(low) < LEAST_SLOPE:
+                _scatter_extremum(phi, sums, band, origins[r], rays[r], lows[r, m, 0], low, back[r], light[r])
+            high = -of_log[r] * s * _phi_of(-s * highs[r, m, 1])
+            if highs[r, m, 0] > 0 and not abs(high) < LEAST_SLOPE:
+                _scatter_extremum(phi, sums, band, origins[r], rays[r], highs[r, m, 0], high, back[r], light[r])

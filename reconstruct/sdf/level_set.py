@@ -1,4 +1,4 @@
-"""A level set: it accumulates the rays' gradient, takes bounded steps along it, and is redistanced to stay an SDF."""
+"""A level set: it gathers the rays' gradient, takes bounded steps along it, and is redistanced to stay an SDF."""
 
 import numpy as np
 import torch
@@ -8,8 +8,10 @@ from reconstruct.sdf import level_set_kernels as levelset
 from reconstruct.sdf.blocks import Blocks, index_of, near_surface, pack, touching
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.kernels import SIDE
-from reconstruct.sdf.rays import PerThread, run, thread_count
+from reconstruct.sdf.rays import run, thread_count
 
+EVIDENCE_FLOOR = 0.01  # ray weights per node: below this a node hardly moves
+CURVATURE_BAND = 3.0  # voxels
 STABLE_BENDING = 1 / 80  # explicit steps of the biharmonic flow are stable below 2 / 12^2
 BAND = 6.0  # voxels about the surface in which the SDF is kept and may move
 WHOLE = BAND - 1e-3  # voxels: a node at the band itself does not move
@@ -18,45 +20,77 @@ BLOCKS_AT_ONCE = 4096  # of a resampling: 100 MB of points
 
 
 class LevelSet:
-    """phi in voxels on the blocks of a box that are near the surface, and a pair of accumulators for each core.
+    """phi in voxels on the blocks of a box that are near the surface, on the CPU or on a torch device.
 
-    Rays add d loss / d phi to the `g` of a core and its absolute value to its `c`. `step` averages both and moves every
-    node by rate * g / (c + floor), so that no node moves by more than `rate` voxels or without evidence.
+    Rays add d loss / d phi, and its absolute value, to `gathered`. `step` averages both and moves every node by
+    rate * g / (c + floor), so that no node moves by more than `rate` voxels or without evidence.
 
     The surface must move by less than BAND between two redistancings, so that the stored blocks contain all changes.
     """
 
-    def __init__(self, phi: np.ndarray | Blocks, origin: np.ndarray, spacing: float, is_distance: bool = False):
-        self.origin, self.spacing = origin, spacing
+    def __init__(
+        self,
+        phi: np.ndarray | Blocks,
+        origin: np.ndarray,
+        spacing: float,
+        is_distance: bool = False,
+        device: torch.device | None = None,
+    ):
+        """Keep the field.
+
+        Args:
+            phi: voxels, on the host.
+            device: where rays are marched by torch; None: on the CPU, by compiled kernels.
+        """
+        self.origin, self.spacing, self.device = origin, spacing, device
         given = phi if isinstance(phi, Blocks) else pack(phi)
         self._keep(near_surface(given, BAND) if is_distance else redistanced(given))
 
     def _keep(self, field: Blocks) -> None:
         """Replace the field: find the nodes that may move, and set the gradient to zero."""
-        self.field = field
-        self._active, self._around = active_nodes(field)
-        self.g, self.c = (PerThread(np.zeros_like(field.pool) for _ in range(thread_count())) for _ in range(2))
-        self._totals = [np.zeros_like(field.pool) for _ in range(2)]  # 0 on all nodes that do not move
-        self._spare = np.zeros_like(field.pool)
-        self._next = field.pool.copy()
+        active, around = active_nodes(field)
+        number = np.full(field.pool.size, len(active), np.int32)  # of the active nodes; of all others, the one after
+        number[active] = np.arange(len(active), dtype=np.int32)
+        around_active = number[around]
+        at_rest = np.where(around_active < len(active), np.float32(0), field.pool.reshape(-1)[around]).sum(1)
+        where = self.device or torch.device("cpu")
+        self._stored, self.values = field, torch.from_numpy(field.pool.reshape(-1)).to(where)
+        self._active, self._around, self._at_rest = (
+            torch.from_numpy(x).to(where) for x in (active, around_active, at_rest)
+        )
+        if self.device is None:  # side by side in memory, as the kernels add to both at once
+            self.gathered = torch.zeros(thread_count(), field.pool.size, 2)
+        else:  # one after the other: the gradients of two tensors
+            self.gathered = torch.zeros(1, 2, field.pool.size, dtype=torch.float64, device=where).transpose(1, 2)
+
+    def on(self, device: torch.device | None) -> "LevelSet":
+        """Return the level set on a device; the same object if it is there."""
+        same = device == self.device
+        return self if same else LevelSet(self.field, self.origin, self.spacing, is_distance=True, device=device)
+
+    @property
+    def field(self) -> Blocks:
+        """The current blocks, on the host."""
+        return self._stored._replace(pool=self.values.cpu().numpy().reshape(self._stored.pool.shape))
 
     @property
     def phi(self) -> Float[np.ndarray, "nx ny nz"]:
-        """A dense copy of phi, float32, voxels."""
+        """A dense copy of phi on the host, float32, voxels."""
         return self.field.dense()
 
     def sums(self) -> Float[np.ndarray, "2 nx ny nz"]:
-        """Return dense copies of the accumulated d loss / d phi, and of the sum of its absolute values over rays."""
-        return np.stack([self.field._replace(pool=np.sum(p, axis=0), far=0.0).dense() for p in (self.g, self.c)])
+        """Return dense copies of the gathered d loss / d phi, and of the sum of its absolute values over rays."""
+        total = torch.where(self.values.abs()[:, None] < BAND, self.gathered.sum(0), 0.0).float().cpu()
+        pools = total.T.reshape(2, *self._stored.pool.shape).contiguous().numpy()
+        return np.stack([self._stored._replace(pool=pool, far=0.0).dense() for pool in pools])
 
     def is_finite(self) -> bool:
-        """Return whether the accumulated gradient is finite: a sum is not finite if one of its terms is not."""
-        return bool(np.isfinite([part.sum() for parts in (self.g, self.c) for part in parts]).all())
+        """Return whether the gathered gradient is finite: a sum is not finite if one of its terms is not."""
+        return bool(self.gathered.sum().isfinite())
 
     def forget(self) -> None:
         """Clear the gradient, without a step."""
-        for part in (*self.g, *self.c):
-            part[...] = 0
+        self.gathered.zero_()
 
     def redistance(self) -> None:
         """Make |grad phi| = 1 within BAND of the same surface, +-BAND beyond; update the nodes that may move."""
@@ -65,24 +99,44 @@ class LevelSet:
     def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int, smoothing: float) -> None:
         """Apply the gradient of the rays and clear it.
 
+        A node moves by -rate * (g - shrink) / (c + floor + shrink), and by the curvature, which is the SDF's Laplacian.
+        Then follow steps of biharmonic flow, phi -= w * Laplacian(Laplacian phi), w = max(floor / (c + floor), least).
+        Where few rays pass, as on hidden sides, the surface becomes a thin plate, not a soap film. Where many pass,
+        `least` smooths their noise. Unlike curvature flow, this does not shrink round shapes: the Laplacian of a ball's
+        SDF is 2 / r, whose Laplacian is zero.
+
         Args:
             passes: of averaging; rate: bound of the step, voxels; shrink: pull on nodes without evidence; curvature: of
                 the flow, in units of rate; stiffness: passes against bending where there is no evidence; smoothing:
                 their weight where there is all evidence, in units of rate.
         """
-        n, nodes, phi = len(self._active), (self._active, self._around), self.field.pool
-        for place, parts in enumerate((self.g, self.c)):
-            flat = tuple(part.reshape(-1) for part in parts)
-            run(levelset.merge, n, flat, self._totals[place].reshape(-1), self._active)
-            for _ in range(passes):
-                run(levelset.smooth, n, self._totals[place], self._spare, *nodes)
-                self._totals[place], self._spare = self._spare, self._totals[place]
-        run(levelset.level_set_step, n, phi, self._next, *self._totals, *nodes, (rate, shrink, curvature * rate))
-        self.field, self._next = self.field._replace(pool=self._next), phi
-        setting = (STABLE_BENDING, smoothing * rate)
+        total = sum(part.index_select(0, self._active) for part in self.gathered)
+        assert isinstance(total, torch.Tensor)
+        total = total.float()
+        self.forget()
+        for _ in range(passes):
+            total = 0.25 * total + 0.125 * self._sum_around(total)
+        gradient, count = total.unbind(1)
+        before = self.values.index_select(0, self._active)
+        phi = before - rate * (gradient - shrink) / (count + EVIDENCE_FLOOR + shrink)
+        if curvature:
+            bent = curvature * rate * self._laplacian(before).clamp(-0.5, 0.5)
+            phi += torch.where(before.abs() < CURVATURE_BAND, bent, 0.0)
+        soft = STABLE_BENDING * (EVIDENCE_FLOOR / (count + EVIDENCE_FLOOR)).clamp(min=smoothing * rate)
         for _ in range(stiffness):
-            run(levelset.laplacian, n, self.field.pool, self._spare, *nodes)
-            run(levelset.stiffen, n, self.field.pool, self._spare, self._totals[1], *nodes, *setting)
+            is_near = phi.abs() < CURVATURE_BAND
+            bend = torch.where(is_near, self._laplacian(phi), 0.0)
+            bending = self._sum_around(bend[:, None])[:, 0] - 6 * bend
+            phi = torch.where(is_near, phi - soft * bending, phi)
+        self.values[self._active] = phi
+
+    def _sum_around(self, values: Float[torch.Tensor, "n columns"]) -> Float[torch.Tensor, "n columns"]:
+        """Return the sum of each active node's six neighbours; those that do not move count as 0."""
+        rows = torch.cat([values, values.new_zeros(1, values.shape[1])])
+        return torch.nn.functional.embedding_bag(self._around, rows, mode="sum")
+
+    def _laplacian(self, phi: Float[torch.Tensor, " n"]) -> Float[torch.Tensor, " n"]:
+        return self._sum_around(phi[:, None])[:, 0] + self._at_rest - 6 * phi
 
     def grid(self) -> SdfGrid:
         """Return a copy as an SdfGrid in the world frame."""

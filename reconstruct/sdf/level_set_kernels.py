@@ -1,4 +1,4 @@
-"""Kernels of the level set: averaging, bounded steps with curvature flow, redistancing. Numba, voxels, on Blocks.
+"""Kernels of the level set: the nodes that move, and redistancing. Numba, voxels, on Blocks.
 
 Pools are those of reconstruct/sdf/blocks.py. `active` are flat pool indices of the nodes that move; `around` are those
 of their six neighbours along z, y, x, before and after.
@@ -10,81 +10,10 @@ import numpy as np
 from numba import njit
 
 from reconstruct.sdf.block_kernels import eikonal, value_at
-from reconstruct.sdf.kernels import FAST, INNER, SHIFT, SIDE, UNCOUNTED, WITHIN
+from reconstruct.sdf.kernels import FAST, INNER, SHIFT, SIDE, WITHIN
 
-EVIDENCE_FLOOR = 0.01  # ray weights per node: below this a node hardly moves
-CURVATURE_BAND = 3.0  # voxels
 LEAST_STEP = 0.57  # voxels: a node's distance exceeds its nearest neighbour's by at least 1 / sqrt(3)
 BESIDE = 2.5  # voxels: beyond this a node has no neighbour on the other side
-
-
-@njit(forceinline=True, **INNER)
-def _around(a, n):
-    """Return the sum of six neighbours."""
-    return a[n[0]] + a[n[1]] + a[n[2]] + a[n[3]] + a[n[4]] + a[n[5]]
-
-
-@njit(**FAST)
-def smooth(source, target, active, around, start, stop):
-    """Write the 7-point average of source to target on the active nodes."""
-    a, b = source.reshape(-1), target.reshape(-1)
-    for r in range(start, stop):
-        i = active[r]
-        b[i] = 0.25 * a[i] + 0.125 * _around(a, around[r])
-
-
-@njit(**UNCOUNTED)
-def merge(parts, target, active, start, stop):
-    """Sum the threads' accumulators into target on the active nodes, in fixed order, and clear them. All are flat."""
-    for r in range(start, stop):
-        i = active[r]
-        value = 0.0
-        for part in parts:
-            value += part[i]
-            part[i] = 0.0
-        target[i] = value
-
-
-@njit(**FAST)
-def level_set_step(phi, target, g, c, active, around, setting, start, stop):
-    """Write phi - rate * (g - shrink) / (c + floor + shrink) to target, and add curvature flow.
-
-    The curvature of an SDF is its Laplacian. A step is at most `rate` voxels; nodes without rays move only by shrink
-    and curvature.
-    """
-    rate, shrink, curvature = setting
-    a, b, gradient, count = phi.reshape(-1), target.reshape(-1), g.reshape(-1), c.reshape(-1)
-    for r in range(start, stop):
-        i = active[r]
-        value = a[i] - rate * (gradient[i] - shrink) / (count[i] + EVIDENCE_FLOOR + shrink)
-        if abs(a[i]) < CURVATURE_BAND:
-            value += curvature * min(max(_around(a, around[r]) - 6 * a[i], -0.5), 0.5)
-        b[i] = value
-
-
-@njit(**FAST)
-def laplacian(phi, out, active, around, start, stop):
-    """Write the Laplacian of phi to out on the active nodes near the surface, 0 beyond."""
-    a, b = phi.reshape(-1), out.reshape(-1)
-    for r in range(start, stop):
-        i = active[r]
-        b[i] = _around(a, around[r]) - 6 * a[i] if abs(a[i]) < CURVATURE_BAND else 0.0
-
-
-@njit(**FAST)
-def stiffen(phi, laplacians, c, active, around, amount, least, start, stop):
-    """Take a step of biharmonic flow: phi -= amount * w * Laplacian(Laplacian phi), in place.
-
-    The weight is w = max(floor / (c + floor), least). Where few rays pass, as on hidden sides, the surface becomes a
-    thin plate, not a soap film. Where many rays pass, `least` smooths their noise. Unlike curvature flow, this does not
-    shrink round shapes: the Laplacian of a ball's SDF is 2 / r, whose Laplacian is zero.
-    """
-    a, b, count = phi.reshape(-1), laplacians.reshape(-1), c.reshape(-1)
-    for r in range(start, stop):
-        i = active[r]
-        if abs(a[i]) < CURVATURE_BAND:
-            weight = max(EVIDENCE_FLOOR / (count[i] + EVIDENCE_FLOOR), least)
-            a[i] -= amount * weight * (_around(b, around[r]) - 6 * b[i])
 
 
 # --- the nodes that move ---------------------------------------------------------------------------------------------

@@ -7,9 +7,10 @@ from reconstruct.config import FitConfig, Level
 from reconstruct.labels.held_out import HeldOut, HeldOuts
 from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
-from reconstruct.solve.backend import MovingSurface, joint_passes
+from reconstruct.sdf.level_set import LevelSet
 from reconstruct.solve.early_stopping import REST, EarlyStopping
 from reconstruct.solve.light_refine import MovingLights, lit_from
+from reconstruct.solve.operators import JointPasses
 from reconstruct.solve.step_guard import StepGuard
 from reconstruct.views import Scenes, each, photo_names, placed
 
@@ -37,7 +38,7 @@ class LevelFit:
     log: Callable[[str], None] = lambda _: None  # called with a sentence for every step that is skipped
 
     def steps(
-        self, surface: MovingSurface, lights: MovingLights, done: int = 0, stopping: EarlyStopping = NO_ERRORS_YET
+        self, surface: LevelSet, lights: MovingLights, done: int = 0, stopping: EarlyStopping = NO_ERRORS_YET
     ) -> Iterator[tuple[int, dict[str, float], EarlyStopping]]:
         """Run iterations done .. level.iterations - 1 and yield each one's number, mean errors and held-out errors.
 
@@ -50,7 +51,7 @@ class LevelFit:
         """
         level, config = self.level, self.config
         scenes = each(self.scenes)
-        ray_pass = joint_passes(surface, placed(scenes), each(self.rays), config)
+        ray_pass = JointPasses(surface, placed(scenes), each(self.rays), config)
         guarded = StepGuard(ray_pass, surface, photo_names(scenes), self.log)
         if lights.are_free or lights.shift.shift.any():
             ray_pass.move_lights(lights.in_grid(surface.origin, surface.spacing))

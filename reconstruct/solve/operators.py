@@ -1,15 +1,9 @@
-"""One iteration of the solver: cast the rays that are not settled, and compute errors and gradients on the surface.
+"""One iteration of the solver: cast the rays that are not settled, and compute errors and gradients on the surface."""
 
-A backend implements the operators: fused kernels on the CPU (kernel_operators.py), or plain torch on any device
-(torch_operators.py). Both backends share all other code of a solve.
-"""
-
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from reconstruct.config import FitConfig
 from reconstruct.labels.supervision import Supervision
@@ -17,8 +11,10 @@ from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
 from reconstruct.sdf.blocks import Blocks
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import lights_to_grid, to_grid
 from reconstruct.sdf.settled import Tiles, Views, unsettled_rays, unsettled_views
+from reconstruct.solve.ray_operators import DrawnRays, RayOperators, Sums
 from reconstruct.views import Scenes, by_scene, first_photos
 
 FEWEST_RAYS = 20_000  # weight of all shadow rays in an iteration, at least: of few pixels, too
@@ -29,59 +25,14 @@ SPARE = 4.0  # times as many are looked at: each iteration draws others, or thei
 GOLDEN = 0.5 * (5**0.5 - 1)  # spreads the photos of a pixel evenly over the draws
 MOST_WRONG = 60  # contradictions in a row that are counted
 NO_GROUND = 1e9  # voxels, along rays above the horizon
-Sums = tuple[float, float]  # of weight * error over rays, and of the weights
-
-
-@dataclass(frozen=True)
-class DrawnRays:
-    """Shadow or camera rays of an iteration, on the host."""
-
-    places: Int[np.ndarray, "rays n"]  # photo and pixel, or the pixel: places in the Supervision
-    weights: Float[np.ndarray, " rays"]
-    misses: Float[np.ndarray, " rays"]  # |T - label|, filled by the shadow operator; -1: the pixel shows no surface
-
-
-@runtime_checkable
-class RayOperators(Protocol):
-    """Losses of rays, and their gradients with respect to the surface and the lights, in one pass.
-
-    Gradients are accumulated on the surface, divided by NeuS s and so in voxels, until its next step. `iteration` is of
-    the whole solve: with the seed it determines every random number. `sharpness` is NeuS s per voxel.
-    """
-
-    def find_surface(self) -> None:
-        """Find where each pixel's ray meets the current surface: the other operators start there."""
-        ...
-
-    def shadow(self, rays: DrawnRays, iteration: int, sharpness: float) -> Sums:
-        """Compare the transmittance from each ray's pixel to its light with the label; fill `misses`."""
-        ...
-
-    def mask(self, rays: DrawnRays, iteration: int, sharpness: float) -> Sums:
-        """Compare the transmittance from camera to ground along pixels' rays with the object mask."""
-        ...
-
-    def normal(self) -> Sums:
-        """Compare the SDF's gradient where pixel rays meet the surface with the pixels' normals: squared distances."""
-        ...
-
-    def light_gradient(self) -> Float[np.ndarray, "photos 4"]:
-        """Return the gradient of the shadow rays since the last call, and the sum of its magnitudes over rays.
-
-        The gradient is with respect to each light's homogeneous x, y, z, grid frame.
-        """
-        ...
-
-    def move_lights(self, lights: Float[np.ndarray, "photos 4"]) -> None:
-        """Set the lights of all further rays; homogeneous, grid frame."""
-        ...
 
 
 class RayPasses:
     """Choose the rays that may leave a gradient, apply the operators to them, and count their contradictions."""
 
-    def __init__(self, operators: RayOperators, scene: Scene, rays: Supervision, config: FitConfig):
-        self.operators, self.scene, self.rays, self.config = operators, scene, rays, config
+    def __init__(self, surface: LevelSet, scene: Scene, rays: Supervision, config: FitConfig):
+        self.scene, self.rays, self.config = scene, rays, config
+        self.operators = RayOperators(surface, scene, rays, config)
         self._count = int((rays.confidence > kernels.NO_WEIGHT).sum())
         self._every_tile: Tiles | None = None
         self._weights = 0.0, 0.0  # of all shadow rays and all camera rays
@@ -182,9 +133,9 @@ class RayPasses:
 class JointPasses:
     """The ray passes of all views over one surface: their gradients add up on it."""
 
-    def __init__(self, passes: Sequence[RayPasses]):
-        self.passes = tuple(passes)
-        self._scenes = tuple(one.scene for one in self.passes)
+    def __init__(self, surface: LevelSet, scenes: Scenes, rays: tuple[Supervision, ...], config: FitConfig):
+        self._scenes = scenes
+        self.passes = tuple(RayPasses(surface, *view, config) for view in zip(scenes, rays, strict=True))
 
     def look(self, surface: SdfGrid, scenes: Scenes, iteration: int, sharpness: float, motion: float) -> None:
         """Choose the rays of all views until the next look, see RayPasses.look."""

@@ -12,8 +12,7 @@ from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet
-from reconstruct.solve.backend import joint_passes
-from reconstruct.solve.operators import EMPHASIS, rays_per_iteration
+from reconstruct.solve.operators import EMPHASIS, JointPasses, rays_per_iteration
 from reconstruct.views import Scenes, each
 
 FEWEST_RAYS = 0.05  # per node, from which shadows determine it: with fewer the error begins to grow
@@ -31,7 +30,7 @@ def ray_counts(
     """
     surface = LevelSet(grid.in_voxels(), grid.origin.double().numpy(), grid.spacing, is_distance=True)
     scenes, rays = each(scenes), each(rays)
-    passes = joint_passes(surface, scenes, rays, config)
+    passes = JointPasses(surface, scenes, rays, config)
     first = sum(level.iterations for level in config.levels)
     passes.look(grid, scenes, first, SHARPNESS, 0.0)
     passes(first, SHARPNESS)

@@ -23,7 +23,6 @@ from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet, resampled
 from reconstruct.sdf.normal_fusion import combine_with_normals
-from reconstruct.solve.backend import surface_on
 from reconstruct.solve.checkpoint import CheckpointWriter, SolveState, fingerprint, load_state, save_state
 from reconstruct.solve.early_stopping import EarlyStopping
 from reconstruct.solve.level import LevelFit, is_rest
@@ -245,7 +244,7 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, tup
         start = resampled(begin.shaped(start.grid(), scenes, labels), level.nodes)
     rays, held_out = _held_out(scenes, rays, config)
     _leave_out(state.left_out, scenes, rays)
-    surface = surface_on(task.device, start)
+    surface = start.on(task.device)
     is_tried, is_accepted = _is_tried(state, scenes, config), state.verdict is not None and state.verdict.is_accepted
     lights, stopping = MovingLights(scenes, state.shift, is_tried or is_accepted), state.stopping
     free = before_trial(level) if is_tried else level

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from reconstruct.solve.backend import MovingSurface
+from reconstruct.sdf.level_set import LevelSet
 from reconstruct.solve.operators import JointPasses
 
 MOST_IN_A_ROW = 5  # a single one may be chance; five steps draw other rays each time, so that the data is at fault
@@ -23,7 +23,7 @@ class StepGuard:
     """Casts the rays of a step, and discards their gradients where a number is not finite."""
 
     def __init__(
-        self, ray_passes: JointPasses, surface: MovingSurface, photo_names: tuple[str, ...], log: Callable[[str], None]
+        self, ray_passes: JointPasses, surface: LevelSet, photo_names: tuple[str, ...], log: Callable[[str], None]
     ):
         """`log` is called with one sentence for every step that is skipped."""
         self._ray_passes, self._surface, self._names, self._log = ray_passes, surface, photo_names, log

@@ -25,7 +25,6 @@ from reconstruct.labels.supervision import DARK_ENOUGH, Supervision, supervise
 from reconstruct.scene import Scene, reduced
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
-from reconstruct.solve.backend import surface_on
 from reconstruct.solve.level import LevelFit
 from reconstruct.solve.light_refine import LightShift, MovingLights, lit_from, no_shift
 from reconstruct.views import Scenes, each, placed
@@ -66,7 +65,7 @@ def try_lights(
     """
     sides, errors = [], []
     for lights in (unmoved, shift):
-        surface = surface_on(device, resampled(found, fit.level.nodes))
+        surface = resampled(found, fit.level.nodes).on(device)
         own = replace(fit, rays=tuple(replace(rays, wrong=rays.wrong.copy()) for rays in each(fit.rays)))
         for _ in own.steps(surface, MovingLights(fit.scenes, lights, False), before_trial(fit.level).iterations):
             pass
@@ -106,7 +105,7 @@ def hull_is_better(scene: Scene, config: FitConfig) -> bool:
         hull = shadow_hull(small, seen, 1, START_LEVEL.nodes)
     except ReconstructionError:
         return False
-    surface = surface_on(None, resampled(hull, START_LEVEL.nodes))
+    surface = resampled(hull, START_LEVEL.nodes)
     lights = MovingLights((small,), no_shift((small,)), False)
     for _ in LevelFit(small, rays, held_out, START_LEVEL, config).steps(surface, lights):
         pass

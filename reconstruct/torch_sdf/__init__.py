@@ -1,6 +1,6 @@
 """The signed distance grid in torch, differentiable, on any device.
 
 Comes in: a grid, and rays.
-Goes out: the same hits, transmittances and steps as of reconstruct/sdf, and the equations of ShadowNeuS and NeuS as
-    published.
+Goes out: hits and transmittances with gradients, by the kernels of reconstruct/sdf or by plain torch, and the equations
+    of ShadowNeuS and NeuS as published.
 """

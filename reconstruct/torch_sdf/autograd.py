@@ -9,8 +9,8 @@
 For given points, use `transmittance(grid, points, lights, sharpness)`. For colour, pass `seen.points`, `seen.normals`
 and `seen.visibility` to `reconstruct.torch_sdf.equations.shade`.
 
-These are in the world frame. The solver on a GPU (reconstruct/solve/torch_operators.py) uses DifferentiableSdf and
-LightRays, which are in the grid frame. Tensors of one call share a device and a floating type, float32 or float64.
+These are in the world frame. The solver on a GPU (reconstruct/torch_sdf/dense.py) uses DifferentiableSdf and LightRays,
+which are in the grid frame. Tensors of one call share a device and a floating type, float32 or float64.
 """
 
 from dataclasses import dataclass
@@ -41,8 +41,8 @@ class Sample(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        values: Float[Tensor, "nx ny nz"],
-        evidence: Float[Tensor, "nx ny nz"] | None,
+        values: Float[Tensor, "*nodes"],
+        evidence: Float[Tensor, "*nodes"] | None,
         points: Float[Tensor, "n 3"],
         sizes: Float[Tensor, " n"] | None,
         volume: Volume,
@@ -50,7 +50,7 @@ class Sample(torch.autograd.Function):
     ) -> Float[Tensor, " n"]:
         """Return the SDF at points, voxels."""
         ctx.save_for_backward(points)
-        ctx.volume, ctx.quantum, ctx.real = volume, quantum, values.dtype
+        ctx.volume, ctx.quantum, ctx.like = volume, quantum, values.detach()
         return volume.sample(points)
 
     @staticmethod
@@ -59,12 +59,12 @@ class Sample(torch.autograd.Function):
         """Return the gradients to values, evidence, points and sizes."""
         (points,), volume, (slope,) = ctx.saved_tensors, ctx.volume, upstream
         of_values, of_evidence, of_points, of_sizes = ctx.needs_input_grad[:4]
-        amount = slope.to(ctx.real)
+        amount = slope.to(ctx.like.dtype)
         if ctx.quantum:
             amount = amount.clamp(-LARGEST, LARGEST)
         index, shares = volume.shares(points, amount, ctx.quantum)
-        nodes = volume.summed(index, shares) if of_values else None
-        sizes = volume.summed(index, shares.abs()) if of_evidence else None
+        nodes = volume.summed(index, shares, ctx.like) if of_values else None
+        sizes = volume.summed(index, shares.abs(), ctx.like) if of_evidence else None
         pull = volume.gradient(points) * slope[:, None] if of_points else None
         return nodes, sizes, pull, slope.abs() if of_sizes else None, None, None
 
@@ -74,8 +74,8 @@ class DifferentiableSdf:
     """An SDF whose samples are differentiable with respect to its node values. Grid frame, voxels."""
 
     volume: Volume  # the values that are sampled
-    values: Float[Tensor, "nx ny nz"]  # receives the gradient of all samples, spread over their nodes
-    evidence: Float[Tensor, "nx ny nz"] | None = None  # receives the sum of these gradients' absolute values
+    values: Float[Tensor, "*nodes"]  # receives the gradient of all samples, spread over their nodes
+    evidence: Float[Tensor, "*nodes"] | None = None  # receives the sum of these gradients' absolute values
     quantum: float = 0.0  # gradients are multiples of it: with float64 values their sum is exact in any order
 
     @classmethod

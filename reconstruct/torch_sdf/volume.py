@@ -20,15 +20,16 @@ class Volume:
     inside: tuple[Float[Tensor, "3"], Float[Tensor, "3"]]  # the corners that samples are moved between
     scale: Float[Tensor, "3"]  # from node coordinates to those of grid_sample, which end at -1 and 1
     offsets: Int[Tensor, "8"]  # from a cell's lower corner to its corners, in the flattened phi
+    stored: Int[Tensor, " nodes"] | None = None  # where the sums of each node are kept; beyond their end: nowhere
 
     @classmethod
-    def of(cls, phi: Float[Tensor, "nx ny nz"]) -> "Volume":
+    def of(cls, phi: Float[Tensor, "nx ny nz"], stored: Int[Tensor, " nodes"] | None = None) -> "Volume":
         """Make a volume of contiguous SDF values."""
         _, ny, nz = phi.shape
         corners = [i * ny * nz + j * nz + k for i in (0, 1) for j in (0, 1) for k in (0, 1)]
         last = torch.tensor(phi.shape, dtype=phi.dtype, device=phi.device) - 1
         inside = (torch.zeros_like(last), last - FACE)
-        return cls(phi, last, inside, 2 / last, torch.tensor(corners, device=phi.device))
+        return cls(phi, last, inside, 2 / last, torch.tensor(corners, device=phi.device), stored)
 
     def sample(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """Return the trilinear SDF at points; outside the box, that of the nearest point on it."""
@@ -67,10 +68,11 @@ class Volume:
         shares = weight.to(amounts.dtype) * amounts[:, None]
         return index, (shares / quantum).round() * quantum if quantum else shares
 
-    def summed(self, index: Int[Tensor, "n 8"], shares: Float[Tensor, "n 8"]) -> Float[Tensor, "nx ny nz"]:
-        """Return the sum of shares at each node: with `shares`, the adjoint of sampling."""
-        nodes = torch.zeros(self.phi.numel(), dtype=shares.dtype, device=shares.device)
-        return nodes.index_add_(0, index.reshape(-1), shares.reshape(-1)).view(self.phi.shape)
+    def summed(self, index: Int[Tensor, "n 8"], shares: Float[Tensor, "n 8"], like: Tensor) -> Tensor:
+        """Return the sum of shares at each node, in the shape of `like`: with `shares`, the adjoint of sampling."""
+        places = index.reshape(-1) if self.stored is None else self.stored[index.reshape(-1)]
+        sums = torch.zeros(like.numel() + 1, dtype=shares.dtype, device=shares.device)
+        return sums.index_add_(0, places, shares.reshape(-1))[:-1].view(like.shape)
 
 
 def central_differences(
