@@ -15,6 +15,7 @@ from reconstruct.sdf.blocks import Blocks, near_surface, overlapping, pack
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.kernels import SIDE
 from reconstruct.sdf.level_set import BAND, LevelSet, resampled
+from reconstruct.sdf.rays import first_surfaces
 from reconstruct.solve.operators import RayPasses
 
 SHAPE = (101, 67, 86)  # no side is a whole number of blocks
@@ -87,7 +88,7 @@ def test_rays_that_leap_find_what_rays_through_every_node_find(sharpness):
     found, expected = np.empty((2, n)), np.empty((2, n))
     for out, blocks in ((found, field), (expected, whole(field.dense()))):
         phi = overlapping(blocks)
-        kernels.first_hits(phi, starts, along, np.full(n, 1e8), out[0], 0, n)
+        out[0], _, _ = first_surfaces(phi, starts, along, np.full(n, 1e8))
         kernels.transmittances(phi, starts, lights, sharpness, out[1], 0, n)
     assert 0.2 < (expected[0] < kernels.FAR).mean() < 0.9 and 0.2 < expected[1].mean() < 0.9
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)

@@ -276,20 +276,6 @@ def test_a_full_disk_ends_a_solve_and_keeps_its_last_checkpoint(scene, straight,
     torch.testing.assert_close(fit(scene, TINY, Stop(), file).grid.values, straight.grid.values, rtol=0, atol=0)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")
-@pytest.mark.parametrize("stop", [3, 13, 29, 40])
-def test_a_solve_on_a_graphics_card_stopped_anywhere_ends_in_the_very_same_surface_and_lights(stop, scene, tmp_path):
-    """Not only nearly: the sums of a card are made in an order that does not depend on its threads."""
-    file, card = tmp_path / "checkpoint.safetensors", torch.device("cuda")
-    straight = fit(scene, TINY, Stop(), device=card)
-    with pytest.raises(KeyboardInterrupt):
-        fit(scene, TINY, Stop(stop), file, device=card)
-    resumed = fit(scene, TINY, Stop(), file, device=card)
-    torch.testing.assert_close(resumed.grid.values, straight.grid.values, rtol=0, atol=0)
-    torch.testing.assert_close(resumed.lights, straight.lights, rtol=0, atol=0)
-    torch.testing.assert_close(resumed.evidence, straight.evidence, rtol=0, atol=0)
-
-
 def test_the_seed_decides(scene, straight):
     other = fit(scene, replace(TINY, seed=1), Stop())
     assert not np.array_equal(other.grid.values.numpy(), straight.grid.values.numpy())

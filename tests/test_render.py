@@ -4,15 +4,11 @@ import numpy as np
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import uniform_filter
 from torch import Tensor
 
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import find_surface, first_hits, in_line_of_sight, run, visibility
-from reconstruct.solve.ray_operators import cross_entropy
 from reconstruct.torch_sdf import equations as render
-from reconstruct.torch_sdf.compiled import CompiledRays
 
 NODES, RADIUS = 40, 11.0
 CENTRE = torch.tensor([19.5, 19.5, 19.5])
@@ -128,37 +124,6 @@ def test_only_the_near_side_of_a_ball_is_in_line_of_sight():
     horizon = RADIUS / 60.0  # of the cosine to the eye
     sure = (around[:, 2] - horizon).abs() > 0.1
     assert torch.equal(seen[sure], around[sure, 2] > horizon)
-
-
-def kernel_gradient(grid: SdfGrid, starts: Tensor, ends: Tensor, label: float, sharpness: float) -> np.ndarray:
-    """d loss / d phi of shadow rays, by the compiled operators."""
-    surface = LevelSet(grid.in_voxels(), np.zeros(3), 1.0, is_distance=True)
-    lights = torch.cat([ends.double(), torch.tensor([[1.0, 0.0]]).expand(len(ends), 2).double()], 1)
-    seen, _ = CompiledRays(surface).march(starts.double(), lights, sharpness, lights.new_ones(len(ends)))
-    target = torch.full_like(seen, label)
-    (cross_entropy(seen.exp(), -seen.expm1(), target).sum() / sharpness).backward()
-    return surface.sums()[0]
-
-
-def test_kernel_gradient_equals_autograd_through_dense_samples():
-    grid = ball_grid()
-    starts, ends = random_rays(300, seed=5)
-    sharpness = 2.0
-    seen = render.transmittance(dense_sdf(grid, starts, ends), sharpness)
-    grey = (seen > 0.1) & (seen < 0.9)  # T / (1 - T) and 1 / T would magnify the small difference in T
-    starts, ends = starts[grey], ends[grey]
-    assert len(starts) >= 5
-    for label in (0.0, 1.0, 0.4):
-        values = grid.values.clone().requires_grad_()
-        dense = render.transmittance(dense_sdf(SdfGrid(values, grid.origin, 1.0), starts, ends, 4000), sharpness)
-        (render.shadow_loss(dense, torch.full_like(dense, label)).sum() / sharpness).backward()
-        found = kernel_gradient(grid, starts, ends, label, sharpness)
-        assert values.grad is not None
-        # The dense form spreads each extremum over its samples, so both are averaged over 3 nodes.
-        expected, found = uniform_filter(values.grad.numpy(), 3), uniform_filter(found, 3)
-        cosine = (expected * found).sum() / np.linalg.norm(expected) / np.linalg.norm(found)
-        assert cosine > 0.98, (label, cosine)
-        assert abs(found.sum() / expected.sum() - 1) < 0.1, label
 
 
 def test_the_parts_of_a_parallel_run_cover_everything_once():

@@ -246,15 +246,3 @@ def test_a_trained_field_becomes_a_mesh_by_the_command(tmp_path, monkeypatch, ca
     assert "--time-budget shortens the default solver" in capsys.readouterr().err
     assert shadowgraph.main([*arguments[:-2], "--force", "--ablate", "sampled"]) == 2
     assert "Add --field neural" in capsys.readouterr().err
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA here")
-def test_a_graphics_card_computes_the_same_first_losses(shadows, frame):
-    scene, _ = shadows
-    found = []
-    for device in ("cpu", "cuda"):
-        model = Model(TINY, unit_height(0.0, frame)).to(device)
-        optimiser = torch.optim.Adam(model.parameters(), lr=1e-3)
-        found.append(next(iterations(model, optimiser, scene, frame, TINY, 0))[1])
-    for name, value in found[0].items():
-        assert found[1][name] == pytest.approx(value, rel=1e-2, abs=1e-4), name

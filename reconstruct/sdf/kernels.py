@@ -308,24 +308,6 @@ def _root(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb):
     return ta + (tb - ta) * fa / (fa - fb)
 
 
-@njit(**UNCOUNTED)
-def first_hits(phi, origins, directions, far, out, start, stop):
-    """Write t of the first zero of the SDF along each ray to out, 1e9 if there is none. Grid frame."""
-    for r in range(start, stop):
-        out[r], _, _ = _first_surface(
-            phi,
-            origins[r, 0],
-            origins[r, 1],
-            origins[r, 2],
-            directions[r, 0],
-            directions[r, 1],
-            directions[r, 2],
-            0.0,
-            far[r],
-            0.0,
-        )
-
-
 @njit(**FAST)
 def transmittances(phi, points, lights, sharpness, out, start, stop):
     """Write the transmittance from each point to its homogeneous light to out. Grid frame, sharpness per voxel."""
@@ -347,21 +329,12 @@ def _towards(lights, k, x, y, z):
 
 
 @njit(**UNCOUNTED)
-def camera_pass(phi, eye, directions, ground_t, width, hit, part_t, part_f, start, stop):
-    """Find the end of every pixel's ray: hit (1e9 if only the ground), and the partial minimum before. Grid frame."""
-    for p in range(start, stop):
-        hit[p], part_t[p], part_f[p] = _first_surface(
-            phi,
-            eye[0],
-            eye[1],
-            eye[2],
-            directions[p, 0],
-            directions[p, 1],
-            directions[p, 2],
-            0.0,
-            ground_t[p],
-            width,
-        )
+def first_surfaces(phi, origins, directions, far, width, hit, part_t, part_f, start, stop):
+    """Find where rays meet the surface: hit (1e9 if nowhere up to far), and the partial minimum before. Grid frame."""
+    for r in range(start, stop):
+        x, y, z = origins[r, 0], origins[r, 1], origins[r, 2]
+        dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
+        hit[r], part_t[r], part_f[r] = _first_surface(phi, x, y, z, dx, dy, dz, 0.0, far[r], width)
 
 
 @njit(forceinline=True, **INNER)

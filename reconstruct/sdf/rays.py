@@ -59,20 +59,20 @@ def run(kernel: Callable[..., T], count: int, *arguments: Any) -> list[T]:
     return list(_pool().map(work, range(n)))
 
 
-def camera_ends(
+def first_surfaces(
     field: Blocks,
-    eye: Float[np.ndarray, "3"],
-    directions: Float[np.ndarray, "pixels 3"],
-    ground_t: Float[np.ndarray, " pixels"],
-    width: float,
-) -> tuple[Float[np.ndarray, " pixels"], Float[np.ndarray, " pixels"], Float[np.ndarray, " pixels"]]:
-    """Return where pixels' rays end on the surface, and t and value of the partial minimum before; grid frame, voxels.
+    origins: Float[np.ndarray, "n 3"],
+    directions: Float[np.ndarray, "n 3"],
+    far: Float[np.ndarray, " n"],
+    width: float = 0.0,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return where rays meet the surface, and t and value of the partial minimum before; grid frame, voxels.
 
-    See kernels.camera_pass.
+    See kernels.first_surfaces.
     """
-    n = len(directions)
-    hit, part_t, part_f = np.empty(n), np.empty(n), np.empty(n)
-    run(kernels.camera_pass, n, field, eye, directions, ground_t, width, hit, part_t, part_f)
+    rays = (np.ascontiguousarray(x) for x in (origins, directions, far))
+    hit, part_t, part_f = (np.empty(len(far)) for _ in range(3))
+    run(kernels.first_surfaces, len(far), field, *rays, width, hit, part_t, part_f)
     return hit, part_t, part_f
 
 
@@ -93,11 +93,9 @@ def find_surface(grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float
         origins: world.
         directions: world, unit length.
     """
-    phi, out = grid.blocks, np.empty(len(origins))
-    start, along = to_grid(grid, origins), np.ascontiguousarray(directions.double().numpy())
-    far = np.full(len(origins), 1e8)
-    run(kernels.first_hits, len(out), phi, start, along, far, out)
-    return torch.from_numpy(np.where(out > kernels.FAR, np.inf, out * grid.spacing)).float()
+    far = np.full(len(origins), kernels.FAR)
+    hit, _, _ = first_surfaces(grid.blocks, to_grid(grid, origins), directions.double().numpy(), far)
+    return torch.from_numpy(np.where(hit > kernels.FAR, np.inf, hit * grid.spacing)).float()
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, UInt8
 
 from reconstruct.sdf import kernels, settled_kernels
 from reconstruct.sdf.blocks import Blocks
-from reconstruct.sdf.rays import camera_ends, run
+from reconstruct.sdf.rays import first_surfaces, run
 
 SIDES = (8, 4, 2)  # px of tiles: of the coarsest one only a few are not settled, the finest saves three marches of four
 
@@ -76,7 +76,8 @@ def unsettled_rays(
     n = len(views.directions)
     hit, part_t, part_f = np.full(n, kernels.NEVER), np.full(n, -1.0), np.zeros(n)
     own = np.flatnonzero(views.role != kernels.GROUND)  # the others' rays start on the ground, wherever the surface is
-    seen = camera_ends(field, views.eye, views.directions[own], views.ground_t[own], views.width)
+    eyes = np.broadcast_to(views.eye, (len(own), 3))
+    seen = first_surfaces(field, eyes, views.directions[own], views.ground_t[own], views.width)
     hit[own], part_t[own], part_f[own] = seen
     around = (views.eye, views.directions, views.ground_t)
     starts, kinds, normals = np.empty((n, 3)), np.empty(n, np.uint8), np.empty((n, 3))

@@ -324,7 +324,7 @@ def _mark(phi, wide, order, pixels, rays, light, above, need, found):
 
 @njit(**UNCOUNTED)
 def find_unsettled_views(phi, wide, eye, directions, ground_t, mask, confidence, need, found, start, stop):
-    """Mark the pixels whose camera ray may leave a gradient in mask_pass. Grid frame."""
+    """Mark the pixels whose camera ray may leave a gradient. Grid frame."""
     for p in range(start, stop):
         found[p] = 0
         if confidence[p] < NO_WEIGHT:

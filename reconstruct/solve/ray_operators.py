@@ -17,14 +17,13 @@ from reconstruct.scene import Scene, lights_in_frame
 from reconstruct.sdf import kernels
 from reconstruct.sdf.kernels import FAR, GRAZING, GROUND, JITTER, MASK_JITTER, MAX_START, NEVER, NO_WEIGHT, OBJECT
 from reconstruct.sdf.level_set import LevelSet
-from reconstruct.sdf.rays import run
-from reconstruct.torch_sdf.equations import area_ratio, moved_intersection
+from reconstruct.sdf.rays import first_surfaces, run
+from reconstruct.torch_sdf.equations import area_ratio, cross_entropy, moved_intersection
 from reconstruct.torch_sdf.ray_field import RayField, ray_field
 from reconstruct.torch_sdf.rays import BATCHES
 from reconstruct.torch_sdf.volume import central_differences
 
 LEAST_SHARE = 1e-3  # of a pixel: a smaller part of it has no gradient
-LEAST_SEEN = 1e-9  # transmittance below which the loss continues as a straight line; likewise for 1 - T
 Sums = tuple[float, float]  # of weight * error over rays, and of the weights
 
 
@@ -49,11 +48,12 @@ class RayOperators:
         self.surface, self.rays, self.config = surface, rays, config
         self.device, self.field = surface.values.device, ray_field(surface)
         origin = torch.from_numpy(np.asarray(surface.origin, np.float64))
-        self.eye = self._moved((scene.eye.double() - origin) / surface.spacing)
+        eye = ((scene.eye.double() - origin) / surface.spacing).numpy()
+        ground_t = np.where(np.isfinite(rays.ground_t), rays.ground_t / surface.spacing, NEVER)
+        self.eye, self.ground_t = self._moved(eye), self._moved(ground_t)
         self.lights = torch.empty(0)
         self.move_lights(lights_in_frame(scene.lights.double(), origin, surface.spacing).numpy())
         self.directions, self.role = self._moved(rays.directions), self._moved(rays.role)
-        self.ground_t = self._moved(np.where(np.isfinite(rays.ground_t), rays.ground_t / surface.spacing, NEVER))
         self.label = torch.from_numpy(rays.label).to(self.device)
         self.width = float(scene.pixel_angle)
         confidence = np.float32(config.normal_weight) * rays.normal_confidence
@@ -61,14 +61,14 @@ class RayOperators:
         # Rays of pixels that surely show ground start there, wherever the surface is.
         own = np.flatnonzero((rays.role != GROUND) | (confidence > NO_WEIGHT))
         self._on_surface = torch.from_numpy(own).to(self.device)
-        self._view = self.directions[self._on_surface], self.ground_t[self._on_surface]
+        self._view = np.tile(eye, (len(own), 1)), rays.directions[own], ground_t[own]
         self.hit, self.part_t = torch.full_like(self.ground_t, NEVER), torch.full_like(self.ground_t, -1.0)
 
     def find_surface(self) -> None:
         """Find where each pixel's ray meets the current surface: the other operators start there."""
         self.field: RayField = ray_field(self.surface)  # the surface moves only after all operators
-        hit, part_t, _ = self.field.first_surface(self.eye, *self._view, self.width)
-        self.hit[self._on_surface], self.part_t[self._on_surface] = hit, part_t
+        hit, part_t, _ = first_surfaces(self.field.blocks, *self._view, self.width)
+        self.hit[self._on_surface], self.part_t[self._on_surface] = self._moved(hit), self._moved(part_t)
 
     def shadow(self, rays: DrawnRays, iteration: int, sharpness: float) -> Sums:
         """Compare the transmittance from each ray's pixel to its light with the label; fill `misses`."""
@@ -200,24 +200,6 @@ class RayOperators:
         """Move values to the device; floating-point values are converted to the type of positions along rays."""
         tensor = values if isinstance(values, Tensor) else torch.from_numpy(values)
         return tensor.to(self.field.real if tensor.is_floating_point() else tensor.dtype).to(self.device)
-
-
-def cross_entropy(
-    seen: Float[Tensor, " n"], absorbed: Float[Tensor, " n"], label: Float[Tensor, " n"]
-) -> Float[Tensor, " n"]:
-    """Return -y log T - (1 - y) log(1 - T), with a finite slope at both ends.
-
-    Args:
-        seen: T, in [0, 1].
-        absorbed: 1 - T, computed without cancellation.
-        label: y, visibility in [0, 1].
-    """
-    return -label * _log(seen) - (1 - label) * _log(absorbed)
-
-
-def _log(x: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Return the logarithm, and below LEAST_SEEN its tangent there."""
-    return torch.where(x > LEAST_SEEN, x.clamp(min=LEAST_SEEN).log(), x / LEAST_SEEN + np.log(LEAST_SEEN) - 1)
 
 
 def _bounded(values: Float[Tensor, " n"], bound: Float[Tensor, " n"]) -> Float[Tensor, " n"]:

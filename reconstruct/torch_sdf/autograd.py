@@ -23,10 +23,12 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import logsigmoid
 
 from reconstruct.scene import lights_in_frame
+from reconstruct.sdf.blocks import overlapping, pack
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.kernels import FAR
+from reconstruct.sdf.rays import first_surfaces
 from reconstruct.torch_sdf.equations import area_ratio, blend, moved_intersection
-from reconstruct.torch_sdf.rays import BATCHES, Extrema, extrema, first_surface, towards
+from reconstruct.torch_sdf.rays import BATCHES, Extrema, extrema, towards
 from reconstruct.torch_sdf.volume import Volume, central_differences
 
 LARGEST = 2.0**16  # bound of one amount that is rounded to a quantum: 2^9 of them on a node sum exactly in float64
@@ -221,9 +223,9 @@ class FirstIntersection(nn.Module):
         """
         field = DifferentiableSdf.of(grid.values / grid.spacing)
         starts, end = (origins - grid.origin.to(origins)) / grid.spacing, (far / grid.spacing).clamp(max=10 * FAR)
-        batches = zip(*(x.split(BATCHES.rays) for x in (starts, directions, end)), strict=True)
-        found = [first_surface(field.volume, *batch, self.pixel_angle) for batch in batches]
-        hit, part_t, _ = (torch.cat(parts) for parts in zip(*found, strict=True))
+        rays = (x.detach().double().cpu().numpy() for x in (starts, directions, end))
+        blocks = overlapping(pack(field.volume.phi.float().cpu().numpy()))
+        hit, part_t, _ = (torch.from_numpy(x).to(far) for x in first_surfaces(blocks, *rays, self.pixel_angle))
         is_hit, is_edge = hit < FAR, part_t > 0
 
         at_hit = starts + torch.where(is_hit, hit, 0.0)[:, None] * directions

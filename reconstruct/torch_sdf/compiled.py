@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from reconstruct.sdf import kernels
 from reconstruct.sdf.blocks import overlapping
 from reconstruct.sdf.level_set import BAND, LevelSet
-from reconstruct.sdf.rays import PerThread, camera_ends, run
+from reconstruct.sdf.rays import PerThread, run
 
 
 class _Found(NamedTuple):
@@ -38,13 +38,6 @@ class CompiledRays:
         shape = (*surface.field.pool.shape, 2)
         self.sums = PerThread(part.numpy().reshape(shape) for part in surface.gathered)
         self._surface = torch.zeros((), requires_grad=True)  # what all results depend on; its own gradient is none
-
-    def first_surface(
-        self, eye: Float[Tensor, "3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, " n"], width: float
-    ) -> tuple[Float[Tensor, " n"], ...]:
-        """See RayField."""
-        found = camera_ends(self.blocks, eye.numpy(), directions.numpy(), far.numpy(), width)
-        return tuple(torch.from_numpy(x) for x in found)
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """See RayField."""

@@ -8,10 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reconstruct.sdf.blocks import SIDE
+from reconstruct.sdf.blocks import SIDE, overlapping
 from reconstruct.sdf.level_set import BAND, LevelSet
 from reconstruct.torch_sdf.autograd import DifferentiableSdf, march
-from reconstruct.torch_sdf.rays import BATCHES, first_surface
 from reconstruct.torch_sdf.volume import Volume
 
 QUANTUM = 2.0**-28  # of the gradients: 4e-9, far below the smallest one that counts (1e-6)
@@ -26,15 +25,16 @@ class DenseRays:
         Args:
             real: type of positions along rays; by default float64 on the CPU and float32 elsewhere.
         """
-        values, device = surface.values, surface.values.device
+        values, device, field = surface.values, surface.values.device, surface.field
+        self.blocks = overlapping(field)
         self.real = real or (torch.float64 if device.type == "cpu" else torch.float32)
-        layout = torch.from_numpy(surface.field.layout).to(device)
-        beyond = values.new_tensor([surface.field.far, -surface.field.far])
+        layout = torch.from_numpy(field.layout).to(device)
+        beyond = values.new_tensor([field.far, -field.far])
         index = torch.where(layout < 0, len(values) // SIDE**3 + (layout & 1), layout).long()
         blocks = torch.cat([values.view(-1, SIDE**3), beyond[:, None].expand(2, SIDE**3)])
         places = torch.arange(len(values), device=device).view(-1, SIDE**3)
         none = torch.full((2, SIDE**3), len(values), device=device)
-        whole, stored = (_in_box(x[index], surface.field.nodes) for x in (blocks, torch.cat([places, none])))
+        whole, stored = (_in_box(x[index], field.nodes) for x in (blocks, torch.cat([places, none])))
         # Leaves of autograd, both 0: a change of phi, and what receives the absolute values of its gradients. Theirs
         # are the sums of the surface.
         leaves = [torch.zeros(len(values), dtype=torch.float64, device=device) for _ in range(2)]
@@ -42,14 +42,6 @@ class DenseRays:
             leaf.requires_grad_().grad = sums
         volume = Volume.of(whole.to(self.real), stored.reshape(-1))
         self.sdf = DifferentiableSdf(volume, leaves[0], leaves[1], QUANTUM)
-
-    def first_surface(
-        self, eye: Float[Tensor, "3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, " n"], width: float
-    ) -> tuple[Float[Tensor, " n"], ...]:
-        """See RayField."""
-        batches = zip(directions.split(BATCHES.rays), far.split(BATCHES.rays), strict=True)
-        found = [first_surface(self.sdf.volume, eye.expand_as(some), some, end, width) for some, end in batches]
-        return tuple(torch.cat(parts) for parts in zip(*found, strict=True))
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """See RayField."""

@@ -1,11 +1,14 @@
 """The paper's equations in plain torch: the reference for the kernels' values and gradients. Any frame and unit."""
 
+import math
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 SMALLEST_FACING = 1e-4  # |n . v| below which the intersection is not moved (as in the authors' code)
+LEAST_SEEN = 1e-9  # transmittance below which the loss continues as a straight line; likewise for 1 - T
 
 
 def opacity_from_sdf(
@@ -107,7 +110,26 @@ def shadow_loss(seen: Float[Tensor, " rays"], label: Float[Tensor, " rays"]) -> 
     The paper uses |T - y| [ShadowNeuS eq:loss_shadow], which saturates where a ray is deeply wrong. The cross entropy
     is linear in the ray's margin there: the depth error was 2 to 3 times lower at equal time in the solver study.
     """
-    return F.binary_cross_entropy(seen.clamp(1e-7, 1 - 1e-7), label, reduction="none")
+    seen = seen.clamp(1e-7, 1 - 1e-7)
+    return cross_entropy(seen, 1 - seen, label)
+
+
+def cross_entropy(
+    seen: Float[Tensor, " n"], absorbed: Float[Tensor, " n"], label: Float[Tensor, " n"]
+) -> Float[Tensor, " n"]:
+    """Return -y log T - (1 - y) log(1 - T), with a finite slope at both ends.
+
+    Args:
+        seen: T, in [0, 1].
+        absorbed: 1 - T, computed without cancellation.
+        label: y, visibility in [0, 1].
+    """
+    return -label * _log(seen) - (1 - label) * _log(absorbed)
+
+
+def _log(x: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Return the logarithm, and below LEAST_SEEN its tangent there."""
+    return torch.where(x > LEAST_SEEN, x.clamp(min=LEAST_SEEN).log(), x / LEAST_SEEN + math.log(LEAST_SEEN) - 1)
 
 
 def _log_transmitted(

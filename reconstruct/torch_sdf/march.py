@@ -22,26 +22,6 @@ KEPT = 12  # recorded blocks: their memory is theirs
 LOG = logging.getLogger(__name__)
 
 
-class Stride(NamedTuple):
-    """How far a ray goes from a sample, voxels; numbers on its device.
-
-    By 0.95 (|SDF| - margin), at least STEP. With a slope, the margin grows by slope * t, and where |SDF| is less than 1
-    above it, the ray goes by STEP.
-    """
-
-    margin: Float[Tensor, ""]
-    slope: Float[Tensor, ""] | None = None
-
-    def after(self, t: Float[Tensor, " n"], f: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-        """Return the step from parameter t, where the SDF is f."""
-        size = f.abs()
-        if self.slope is None:
-            return (0.95 * (size - self.margin)).clamp(min=STEP)
-        half = self.slope * t
-        step = (0.95 * (size - self.margin - half)).clamp(min=STEP)
-        return torch.where(size < self.margin + 1 + half, STEP, step)
-
-
 class State(NamedTuple):
     """Rays under way."""
 
@@ -53,12 +33,15 @@ class State(NamedTuple):
     factor: Float[Tensor, " n"]  # of the next step
 
     def block(
-        self, volume: Volume, stride: Stride, samples: int
+        self, volume: Volume, margin: Float[Tensor, ""], samples: int
     ) -> tuple[Float[Tensor, "samples n"], Float[Tensor, "samples n"]]:
-        """Return parameter and SDF of the next samples; at a ray's end its last one is repeated."""
+        """Return parameter and SDF of the next samples; at a ray's end its last one is repeated.
+
+        A ray goes by 0.95 (|SDF| - margin) voxels from a sample, at least STEP.
+        """
         t, f, times, values = self.t, self.f, [], []
         for number in range(samples):
-            step = stride.after(t, f)
+            step = (0.95 * (f.abs() - margin)).clamp(min=STEP)
             t = torch.minimum(t + (self.factor * step if number == 0 else step), self.end)
             f = volume.sample(torch.addcmul(self.origins, t[:, None], self.directions))
             times.append(t)
@@ -67,19 +50,19 @@ class State(NamedTuple):
 
 
 def marched(
-    volume: Volume, rays: State, stride: Stride
+    volume: Volume, rays: State, margin: Float[Tensor, ""]
 ) -> tuple[Float[Tensor, "samples n"], Float[Tensor, "samples n"]]:
     """Return parameter and SDF of every sample after the first; after a ray's end its last sample is repeated."""
-    recorded = _recorded_block(volume, stride, len(rays.t))
-    rows = _one_by_one(volume, rays, stride) if recorded is None else recorded.march(volume, rays, stride)
+    recorded = _recorded_block(volume, margin, len(rays.t))
+    rows = _one_by_one(volume, rays, margin) if recorded is None else recorded.march(volume, rays, margin)
     times, values = zip(*rows, strict=True)
     return torch.cat(times), torch.cat(values)
 
 
-def _one_by_one(volume: Volume, rays: State, stride: Stride) -> list[tuple[Tensor, Tensor]]:
+def _one_by_one(volume: Volume, rays: State, margin: Float[Tensor, ""]) -> list[tuple[Tensor, Tensor]]:
     alive, rows = torch.arange(len(rays.t), device=rays.t.device), [(rays.t[None], rays.f[None])]
     while len(alive):
-        block = rays.block(volume, stride, BLOCK)
+        block = rays.block(volume, margin, BLOCK)
         whole = tuple(row[-1].expand(BLOCK, -1).clone() for row in rows[-1])
         for all_rays, some in zip(whole, block, strict=True):
             all_rays[:, alive] = some
@@ -96,10 +79,10 @@ def _one_by_one(volume: Volume, rays: State, stride: Stride) -> list[tuple[Tenso
 class RecordedBlock:
     """A block of one number of rays, of volumes of one shape, in memory of its own."""
 
-    def __init__(self, volume: Volume, stride: Stride, count: int):
+    def __init__(self, volume: Volume, margin: Float[Tensor, ""], count: int):
         """Make the memory of a block of `count` rays; until `record`, it runs operation by operation."""
         self.volume = replace(volume, phi=volume.phi.clone())
-        self.stride = Stride(*(None if x is None else x.clone() for x in stride))
+        self.margin = margin.clone()
         empty = volume.phi.new_zeros
         self.rays = State(empty(count, 3), empty(count, 3), empty(count), empty(count), empty(count), empty(count))
         self.replay = self._run
@@ -124,19 +107,19 @@ class RecordedBlock:
         self.replay = graph.replay
 
     def _run(self) -> None:
-        self.times, self.values = self.rays.block(self.volume, self.stride, RECORDED)
+        self.times, self.values = self.rays.block(self.volume, self.margin, RECORDED)
         self.rays.t.copy_(self.times[-1])
         self.rays.f.copy_(self.values[-1])
         self.rays.factor.fill_(1.0)
         self.goes_on = (self.rays.t < self.rays.end).any()
 
-    def march(self, volume: Volume, rays: State, stride: Stride) -> list[tuple[Tensor, Tensor]]:
+    def march(self, volume: Volume, rays: State, margin: Float[Tensor, ""]) -> list[tuple[Tensor, Tensor]]:
         """Return what `marched` does, by blocks."""
         count, rows = len(rays.t), [(rays.t[None], rays.f[None])]
         self.volume.phi.copy_(volume.phi)
-        for mine, given in zip((*self.stride, *self.rays), (*stride, *rays), strict=True):
-            if mine is not None and given is not None:
-                mine[: len(given)].copy_(given) if given.dim() else mine.copy_(given)
+        self.margin.copy_(margin)
+        for mine, given in zip(self.rays, rays, strict=True):
+            mine[:count].copy_(given)
         self.rays.end[count:] = self.rays.t[count:] = 0.0
         goes_on = True
         while goes_on:
@@ -149,19 +132,19 @@ class RecordedBlock:
 _blocks: dict[tuple, RecordedBlock | None] = {}  # of this process, which uses one device; None: nothing can be recorded
 
 
-def _recorded_block(volume: Volume, stride: Stride, count: int) -> RecordedBlock | None:
+def _recorded_block(volume: Volume, margin: Float[Tensor, ""], count: int) -> RecordedBlock | None:
     """Return the block for so many rays on a CUDA device; None elsewhere, and where none can be recorded."""
     if not volume.phi.is_cuda or not count:
         return None
     size = max(FEWEST, 1 << (count - 1).bit_length())
-    key = (volume.phi.shape, volume.phi.dtype, stride.slope is None, size)
+    key = (volume.phi.shape, volume.phi.dtype, size)
     if key in _blocks:
         _blocks[key] = _blocks.pop(key)  # now the one used last
         return _blocks[key]
     while len(_blocks) >= KEPT:
         del _blocks[next(iter(_blocks))]
     try:
-        block = RecordedBlock(volume, stride, size)
+        block = RecordedBlock(volume, margin, size)
         block.record()
         _blocks[key] = block
     except torch.OutOfMemoryError:

@@ -1,4 +1,4 @@
-"""What the solver asks of a surface: where rays meet it, and how much light passes, differentiable by torch.
+"""What the solver asks of a surface: its SDF at points, and how much light passes along rays, differentiable by torch.
 
 Two implementations: compiled kernels on the CPU, and plain torch on any device.
 """
@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from reconstruct.sdf.blocks import Blocks
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.torch_sdf.compiled import CompiledRays
 from reconstruct.torch_sdf.dense import DenseRays
@@ -19,12 +20,7 @@ class RayField(Protocol):
     """The surface of a level set as it is now, grid frame, voxels. A backward pass adds to the level set's sums."""
 
     real: torch.dtype  # of all tensors
-
-    def first_surface(
-        self, eye: Float[Tensor, "3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, " n"], width: float
-    ) -> tuple[Float[Tensor, " n"], ...]:
-        """Return where pixels' rays end, and parameter and SDF of the silhouette before, see rays.first_surface."""
-        ...
+    blocks: Blocks  # the SDF on the host
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Return central differences over one voxel, constants."""
