@@ -12,7 +12,7 @@ from calibration.flashlight.led_offset import BackView, LensReading, choose, in_
 from calibration.flashlight.led_photo import read_phone_back
 from calibration.pose import Pose
 from capture.errors import CalibrationError, CaptureError
-from capture.session.declared_objects import PhoneBack, parse_phone_back
+from capture.session.declared_objects import PhoneBack
 from capture.session.session import load_session, load_settings
 
 THREE = BackOfPhone(lenses=((-22.0, 60.0, 6.5), (-22.0, 44.0, 6.5), (-8.0, 40.0, 5.5)))
@@ -146,10 +146,11 @@ def test_the_settings_are_read_or_refused_by_name(tmp_path):
     path.write_text("phone_back = { led_px = [1131, 563.5], thickness_mm = 9 }\n")
     assert load_settings(tmp_path).phone_back == PhoneBack((1131.0, 563.5), None, 9.0)
     for wrong, said in [
-        ([3], "table"),
-        ({"led": 1}, "table"),
-        ({"lens_px": [1]}, "lens_px"),
-        ({"thickness_mm": -1}, "thickness_mm"),
+        ("[3]", "phone_back is .*a table of names and values"),
+        ("{ led = 1 }", "phone_back has the unknown entry 'led'; led_px, lens_px, thickness_mm are known"),
+        ("{ lens_px = [1] }", "phone_back.lens_px is .*two numbers in pixels"),
+        ("{ thickness_mm = -1 }", "phone_back.thickness_mm is -1; needed: a length in millimetres"),
     ]:
+        path.write_text(f"phone_back = {wrong}\n")
         with pytest.raises(CaptureError, match=said):
-            parse_phone_back(wrong, path)
+            load_settings(tmp_path)

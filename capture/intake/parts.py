@@ -13,12 +13,15 @@ from collections.abc import AsyncIterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Annotated
+
+from msgspec import Meta
 
 from capture.decode.formats import is_photo_name
 from capture.errors import CaptureError, UserError
 from capture.files.atomic import read_json, write_json
-from capture.files.json_field import JsonField
 from capture.files.regular import why
+from capture.files.schema import Number, as_type
 from capture.intake.archive import unpack
 from capture.intake.arrivals import (
     MOST_FILES,
@@ -55,10 +58,10 @@ class Part:
     id: str
     capture: str  # the capture's folder, relative to the studio's
     name: str  # as the sender gave it, with folders
-    size: int  # bytes
+    size: Annotated[int, Meta(ge=1, le=2**53)]  # bytes
     role: str = ""
     sender: str = ""  # who alone may go on with it
-    began: float = 0.0  # seconds since 1970
+    began: Number = 0.0  # seconds since 1970
     arrived: tuple[str, ...] = ()  # where it is now, relative to its capture; several of an archive
     remarks: tuple[str, ...] = ()  # what was not taken of it
     refused: str = ""  # why it was not taken at all
@@ -256,19 +259,7 @@ class Parts:
 def _read(path: Path) -> Part | None:
     """Return what was noted of a file; None for another file, or one that was lost."""
     try:
-        row = JsonField(read_json(path), str(path))
-        part = Part(
-            row["id"].text(),
-            row["capture"].text(),
-            row["name"].text(),
-            row["size"].count(),
-            row["role"].text(),
-            row["sender"].text(),
-            row["began"].number(),
-            tuple(entry.text() for entry in row["arrived"].entries()),
-            tuple(entry.text() for entry in row["remarks"].entries()),
-            row["refused"].text(),
-        )
+        part = as_type(read_json(path), Part, str(path))
     except (OSError, ValueError, UserError):
         return None
     if path.stem != part.id or not _ID.fullmatch(part.id):

@@ -6,23 +6,27 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct
 
 from capture.decode.formats import is_photo_name
 from capture.errors import CaptureError
 from capture.files.names import is_clip_name, natural_order, refuse_no_folder, stored_file
 from capture.files.regular import why
+from capture.files.schema import Number, Positive, Text, Vector, as_type
 from capture.photos.finding import Finding, grouped
 from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
 from capture.session.declared_objects import (
+    MOST_LIGHTS,
+    THICKEST_BOARD,
+    Cube,
     DeclaredObjects,
     Height,
+    Peg,
     PhoneBack,
-    is_number,
-    parse_declared,
     parse_height,
-    parse_phone_back,
-    parse_thickness,
 )
 from capture.session.roles import NoBoardError, Roles
 from capture.session.seen import SeenPhotos
@@ -48,21 +52,6 @@ SETTINGS_FILE = "session.toml"
 NEVER_READ = "gt"  # ground truth of simulated captures
 CLIP_FRAMES = 40  # chosen from a clip: further ones lie between these
 MOST_CLIP_FRAMES = 300
-SETTINGS = (
-    "ball",
-    "board",
-    "board_thickness_mm",
-    "clip_frames",
-    "cubes",
-    "height",
-    "led_offset_mm",
-    "light",
-    "lights_at_once",
-    "pegs",
-    "phone_back",
-    "roles",
-    "scale",
-)
 MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 
 
@@ -80,6 +69,55 @@ class SessionSettings:
     scale: float | None = None  # mm: the object's height, or without ground its largest extent in the picture
     height: Height | None = None  # of the object's highest point above the table
     board_thickness_mm: float | None = None  # from the table to the printed side: paper, and what it is glued to
+
+
+class _SessionFile(Struct, forbid_unknown_fields=True):
+    """session.toml."""
+
+    board: Annotated[Text, Meta(description='a text such as "checkerboard:9x6:24.25"')] | None = None
+    led_offset_mm: Annotated[Vector, Meta(description="three numbers in millimetres")] | None = None
+    roles: Annotated[
+        dict[Literal["board", "lit", "light", "dark", "side"], list[str]],
+        Meta(description="lists of file names under board, lit, light, dark or side"),
+    ] = msgspec.field(default_factory=dict)
+    clip_frames: Annotated[
+        int,
+        Meta(
+            ge=FEWEST_LIT,
+            le=MOST_CLIP_FRAMES,
+            description=f"a whole number from {FEWEST_LIT} to {MOST_CLIP_FRAMES}",
+        ),
+    ] = CLIP_FRAMES
+    pegs: tuple[Peg, ...] = ()
+    cubes: tuple[Cube, ...] = ()
+    light: Literal["flashlight", "sun"] = "flashlight"
+    lights_at_once: Annotated[
+        int, Meta(ge=1, le=MOST_LIGHTS, description=f"a whole number from 1 to {MOST_LIGHTS}")
+    ] = 1
+    phone_back: PhoneBack = PhoneBack()
+    ball: (
+        Annotated[
+            tuple[Number, Number, Positive],
+            Meta(description="[x, y, radius] of the ball in pixels of the photos as stored"),
+        ]
+        | None
+    ) = None
+    scale: Any = None  # a text, see parse_length
+    height: Any = None  # a number or a text, see parse_height
+    board_thickness_mm: (
+        Annotated[
+            float,
+            Meta(
+                ge=0,
+                le=THICKEST_BOARD,
+                description=(
+                    f"millimetres from the table to the board's printed side, 0 to {THICKEST_BOARD:g}, measured with "
+                    "what it is glued to; 0: the object stands on it"
+                ),
+            ),
+        ]
+        | None
+    ) = None
 
 
 @dataclass(frozen=True)
@@ -145,26 +183,20 @@ def load_settings(folder: Path) -> SessionSettings:
     path = folder / SETTINGS_FILE
     if not path.exists():
         return SessionSettings()
-    entries = read_entries(path)
-    unknown = sorted(set(entries) - set(SETTINGS))
-    if unknown:
-        known = f"{', '.join(SETTINGS[:-1])} and {SETTINGS[-1]}"
-        raise CaptureError(f"{path} has the unknown entry '{unknown[0]}'; {known} are known.")
-    board = entries.get("board")
-    if board is not None and not isinstance(board, str):
-        raise CaptureError(f'{path}: board is {board!r}, a text such as "checkerboard:9x6:24.25" is needed.')
-    count = entries.get("clip_frames", CLIP_FRAMES)
-    if type(count) is not int or not FEWEST_LIT <= count <= MOST_CLIP_FRAMES:
-        raise CaptureError(
-            f"{path}: clip_frames is {count!r}, a whole number from {FEWEST_LIT} to {MOST_CLIP_FRAMES} is needed."
-        )
-    offset, names = _offset(entries.get("led_offset_mm"), path), _role_names(entries.get("roles"), path)
-    back = parse_phone_back(entries.get("phone_back"), path)
-    scale = None if "scale" not in entries else parse_length(entries["scale"], f"{path}: scale")
-    ball = _ball(entries.get("ball"), path)
-    height = parse_height(entries.get("height"), path)
-    thick = parse_thickness(entries.get("board_thickness_mm"), path)
-    return SessionSettings(board, offset, names, count, parse_declared(entries, path), back, ball, scale, height, thick)
+    found = as_type(read_entries(path), _SessionFile, str(path), "", CaptureError)
+    solids = tuple(one.solid() for one in (*found.pegs, *found.cubes))
+    return SessionSettings(
+        board=found.board,
+        led_offset_mm=found.led_offset_mm,
+        roles=tuple((role, tuple(names)) for role, names in found.roles.items()),
+        clip_frames=found.clip_frames,
+        declared=DeclaredObjects(solids, found.light, found.lights_at_once),
+        phone_back=found.phone_back,
+        ball=found.ball,
+        scale=None if found.scale is None else parse_length(found.scale, f"{path}: scale"),
+        height=parse_height(found.height, path),
+        board_thickness_mm=found.board_thickness_mm,
+    )
 
 
 def read_entries(path: Path) -> dict[str, Any]:
@@ -196,35 +228,6 @@ def parse_length(value: Any, where: str) -> float:
             f'{where} is {value!r}, a length with its unit such as "120 mm" ({", ".join(MILLIMETRES)}) is needed.'
         )
     return length
-
-
-def _offset(value: Any, path: Path) -> tuple[float, float, float] | None:
-    if value is None:
-        return None
-    if not isinstance(value, list) or len(value) != 3 or not all(is_number(v) for v in value):
-        raise CaptureError(f"{path}: led_offset_mm is {value!r}, three numbers in millimetres are needed.")
-    return float(value[0]), float(value[1]), float(value[2])
-
-
-def _ball(value: Any, path: Path) -> tuple[float, float, float] | None:
-    if value is None:
-        return None
-    if not isinstance(value, list) or len(value) != 3 or not all(is_number(v) for v in value) or value[2] <= 0:
-        raise CaptureError(
-            f"{path}: ball is {value!r}; [x, y, radius] of the ball in pixels of the photos as stored is needed."
-        )
-    return float(value[0]), float(value[1]), float(value[2])
-
-
-def _role_names(value: Any, path: Path) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    if value is None:
-        return ()
-    is_table = isinstance(value, dict) and set(value) <= set(ROLE_FOLDERS)
-    if not is_table or not all(isinstance(n, list) and all(isinstance(k, str) for k in n) for n in value.values()):
-        raise CaptureError(
-            f"{path}: roles is {value!r}, lists of file names under board, lit, light, dark or side are needed."
-        )
-    return tuple((role, tuple(names)) for role, names in value.items())
 
 
 def board_photos(folder: Path) -> tuple[Path, ...]:

@@ -14,16 +14,18 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta, Struct
 
 from calibration.scenes.importers import IMPORTERS, OF_A_CAPTURE
 from capture.decode.formats import is_photo_name
 from capture.errors import CaptureError, UserError
 from capture.files.atomic import read_json, write_json
-from capture.files.json_field import JsonField
 from capture.files.names import is_clip_name, refuse_no_folder
+from capture.files.schema import FileName, Number, Text, as_type
 from capture.session.session import ROLE_FOLDERS
 from reconstruct.run_folder.lock import LOCK, lock_holder
 from reconstruct.stored_run.documents import MOST_PHOTOS, checked_report
@@ -43,7 +45,7 @@ LEAVING_S = 30.0  # seconds for the cluster to end the run of a dead worker; mor
 class Task:
     """One capture to run."""
 
-    name: str  # of its folder of results
+    name: FileName  # of its folder of results
     capture: str  # its path
     out: str  # the batch's folder
     options: tuple[str, ...] = ()  # of `shadowgraph run`
@@ -55,14 +57,19 @@ class Task:
 class Outcome:
     """How one capture ended."""
 
-    name: str
-    capture: str
-    options: tuple[str, ...]
+    name: FileName
+    capture: Text
+    options: tuple[Text, ...]
     exit_code: int  # 0 done, 2 refused with a sentence, negative: killed by that signal, 1: a defect of ours
-    sentence: str  # why it failed; empty if it did not
-    seconds: float
-    began: float  # seconds since 1970; a file of the capture changed later than this may not be in the result
+    sentence: Text  # why it failed; empty if it did not
+    seconds: Number
+    began: Number  # seconds since 1970; a file of the capture changed later than this may not be in the result
     report: dict[str, Any] = field(default_factory=dict)  # the part of report.json that the page of results shows
+
+
+class _BatchFile(Struct):
+    format: Literal[1]
+    outcomes: Annotated[tuple[Outcome, ...], Meta(max_length=MOST_PHOTOS)]
 
 
 KEPT = ("unit", "photos", "warnings", "stages", "mesh")  # of report.json
@@ -304,29 +311,13 @@ def load_outcomes(file: Path) -> dict[str, Outcome]:
     if not file.is_file():
         return {}
     try:
-        document = read_json(file)
-        if document["format"] != FORMAT:
-            raise ValueError(f"format {document['format']!r}")
-        rows = [_outcome(row) for row in JsonField(document, str(file))["outcomes"].entries(MOST_PHOTOS)]
-    except (OSError, UserError, ValueError, KeyError, TypeError) as error:
+        rows = as_type(read_json(file), _BatchFile, str(file), "").outcomes
+        rows = [replace(row, report=checked_report(row.report, str(file))) for row in rows]
+    except (OSError, UserError, ValueError) as error:
         raise CaptureError(
             f"{file} is not the record of a batch ({error}). Move it away, or give another --out."
         ) from error
     return {row.name: row for row in rows}
-
-
-def _outcome(row: JsonField) -> Outcome:
-    """Return an outcome as it is stored."""
-    return Outcome(
-        row["name"].file_name(),
-        row["capture"].text(),
-        tuple(option.text() for option in row["options"].entries()),
-        row["exit_code"].count(-(2**31), 2**31),
-        row["sentence"].text(),
-        row["seconds"].number(),
-        row["began"].number(),
-        checked_report(row.get("report", {})),
-    )
 
 
 def _is_done(task: Task, outcome: Outcome | None) -> bool:

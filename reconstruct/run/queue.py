@@ -13,12 +13,14 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
 import psutil
+from msgspec import Struct
 
 from capture.errors import CaptureError, UserError
 from capture.files.atomic import read_json, write_json
-from capture.files.json_field import JsonField
+from capture.files.schema import Count, Number, Text, as_type
 from reconstruct.run.batch import PROGRAM, Task, log_file, start_task, why_it_failed
 from reconstruct.run_folder.folder import LOG, read_log
 from reconstruct.run_folder.lock import LOCK, lock_holder
@@ -35,15 +37,15 @@ SAME_START_S = 1.0  # ids are reused: the same id with another start time is ano
 class Job:
     """One run that was asked for."""
 
-    id: str
+    id: Text
     task: Task
-    state: str = WAITING
-    asked: float = 0.0  # seconds since 1970
-    began: float = 0.0
-    ended: float = 0.0
-    pid: int = 0  # of its process, while it runs
-    started: float = 0.0  # of that process, by the system
-    sentence: str = ""  # why it failed
+    state: Literal["waiting", "running", "finished", "failed", "stopped"] = WAITING
+    asked: Number = 0.0  # seconds since 1970
+    began: Number = 0.0
+    ended: Number = 0.0
+    pid: Count = 0  # of its process, while it runs
+    started: Number = 0.0  # of that process, by the system
+    sentence: Text = ""  # why it failed
 
     @property
     def run(self) -> Path:
@@ -59,6 +61,11 @@ class Job:
     def is_open(self) -> bool:
         """True while it waits or runs."""
         return self.state in (WAITING, RUNNING)
+
+
+class _QueueFile(Struct):
+    format: Literal[1]
+    jobs: list[Job]
 
 
 class Queue:
@@ -259,19 +266,8 @@ def _load(file: Path, program: tuple[str, ...]) -> list[Job]:
     if not file.is_file():
         return []
     try:
-        document = JsonField(read_json(file), str(file))
-        if document["format"].value != FORMAT:
-            raise ValueError(f"format {document['format'].value!r}")
-        return [_job(row, program) for row in document["jobs"].entries()]
+        jobs = as_type(read_json(file), _QueueFile, str(file), "").jobs
+        threads = psutil.cpu_count() or 1
+        return [replace(job, task=replace(job.task, threads=threads, program=program)) for job in jobs]
     except (OSError, UserError, ValueError) as error:
         raise CaptureError(f"{file} is not the record of a queue ({error}). Move it away; the runs stay.") from error
-
-
-def _job(row: JsonField, program: tuple[str, ...]) -> Job:
-    task = row["task"]
-    options = tuple(option.text() for option in task["options"].entries())
-    threads = psutil.cpu_count() or 1
-    found = Task(task["name"].file_name(), task["capture"].text(), task["out"].text(), options, threads, program)
-    times = (row["asked"].number(), row["began"].number(), row["ended"].number())
-    process = (row["pid"].count(0), row["started"].number())
-    return Job(row["id"].text(), found, row["state"].text(*STATES), *times, *process, row["sentence"].text())

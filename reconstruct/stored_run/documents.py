@@ -3,12 +3,13 @@
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 from calibration.calibrated_views import CalibratedView
-from capture.errors import CaptureError
 from capture.files.atomic import parse_json
-from capture.files.json_field import JsonField, read_document
+from capture.files.schema import FileName, NotNegative, Number, Text, Vector, as_type, check_numbers, read_as
 
 REPORT, MANIFEST, CHECK = "report.json", "manifest.json", "check.json"
 MANIFEST_FORMAT = 1
@@ -17,9 +18,101 @@ MOST_PHOTOS = 10_000
 LONGEST_LINE = 1 << 16  # bytes of a line of the log
 MOST_LINES = 200_000  # of the log that are read
 LARGEST_COUNT = 1e15
-FULL_TURN = 360.0  # degrees
 PROGRESS = {"t": 0.0, "cpu_s": 0.0, "done": 0.0, "total": 0.0}  # numbers of a line, and what stands for a missing one
 RUN_AGAIN = "Run again, or ask for the file again."
+Angle = Annotated[float, Meta(ge=-360, le=360, description="an angle in degrees")]
+Scalar = Text | Number | bool | None  # what is shown as it stands
+
+
+class _Cost(Struct, forbid_unknown_fields=True):
+    seconds: NotNegative = 0.0
+    cpu_seconds: NotNegative = 0.0
+    peak_memory_bytes: NotNegative = 0.0
+
+
+class _Photo(Struct):
+    name: FileName | None = None
+    used: bool | None = None
+    role: Text | None = None
+    reason: Text | None = None
+
+
+class _Refined(Struct):
+    photo: FileName
+    moved: Number
+    sigmas: Number
+    sigma: Vector
+    position: Vector | UnsetType = UNSET
+    direction: Vector | UnsetType = UNSET
+
+
+class _Trial(Struct):
+    sentence: Text
+    accepted: bool
+
+
+class _Share(Struct):
+    share: Number
+
+
+class _Mesh(Struct):
+    size: Vector | None = None
+    evidence: dict[str, _Share] | None = None
+
+
+class _Report(Struct):
+    """Of report.json, what is read."""
+
+    error: Text | None = None
+    verdict: Text | None = None
+    command: Text | None = None
+    capture: Text | None = None
+    unit: Text | None = None
+    scale: Text | None = None
+    warnings: list[Text] | None = None
+    assumptions: list[Text] | None = None
+    photos: Annotated[list[_Photo], Meta(max_length=MOST_PHOTOS)] | None = None
+    stages: Annotated[dict[str, _Cost], Meta(max_length=MOST_STAGES)] | None = None
+    fit: dict[str, Scalar] | None = None
+    versions: Annotated[dict[str, Scalar], Meta(max_length=MOST_VERSIONS)] | None = None
+    light_trial: _Trial | None = None
+    refined_lights: Annotated[list[_Refined], Meta(max_length=MOST_PHOTOS)] | None = None
+    mesh: _Mesh | None = None
+
+    def __post_init__(self) -> None:
+        if len({light.position is UNSET for light in self.refined_lights or ()}) > 1:
+            raise ValueError("refined_lights are of two kinds; needed: all with a position, or none")
+
+
+class _Manifest(Struct):
+    format: Annotated[Literal[1], Meta(description="format 1, which this version reads")]
+    inputs: dict[str, Text] = {}
+    config: dict[str, Any] = {}
+    costs: Annotated[dict[str, _Cost], Meta(max_length=MOST_STAGES)] = {}
+    finished: Annotated[list[Text], Meta(max_length=MOST_STAGES)] = []
+    made_with: Annotated[dict[str, Any], Meta(max_length=MOST_STAGES)] = {}
+
+
+class _CheckedLight(Struct):
+    photo: FileName
+    used: bool
+    azimuth: Angle
+    elevation: Angle
+
+
+class _Finding(Struct):
+    photo: Text
+    kind: Text
+    text: Text
+
+
+class _Check(Struct):
+    verdict: Text | None = None
+    sentence: Text | None = None
+    reasons: list[Text] | None = None
+    advice: list[Text] | None = None
+    lights: Annotated[list[_CheckedLight], Meta(max_length=MOST_PHOTOS)] | None = None
+    findings: Annotated[list[_Finding], Meta(max_length=MOST_PHOTOS)] | None = None
 
 
 def read_report(path: Path) -> dict[str, Any]:
@@ -28,58 +121,22 @@ def read_report(path: Path) -> dict[str, Any]:
     Raises:
         CalibrationError: it cannot be read, or a value is of another kind; names it.
     """
-    return checked_report(read_document(path, RUN_AGAIN))
+    return _without_null(read_as(path, _Report, RUN_AGAIN)[1])
 
 
-def checked_report(document: JsonField) -> dict[str, Any]:
-    """Return the content of report.json, or a part of it, after the check that `read_report` makes.
+def checked_report(report: Any, file: str) -> dict[str, Any]:
+    """Return a part of a report.json that another file holds, after the check that `read_report` makes.
 
     Raises:
         CalibrationError: a value is of another kind; names it.
     """
-    report = document.any_numbers()
-    for name in ("error", "verdict", "command", "capture", "unit", "scale"):
-        document.get(name, "").text()
-    for name in ("warnings", "assumptions"):
-        for line in document.get(name, []).entries():
-            line.text()
-    for row in document.get("photos", []).entries(MOST_PHOTOS):
-        row.get("name", "-").file_name()
-        row.get("used", True).flag()
-        row.get("role", "").text()
-        row.get("reason", "").text()
-    _costs(document.get("stages", {}))
-    for value in document.get("fit", {}).items().values():
-        _scalar(value)
-    for value in _few(document.get("versions", {}), MOST_VERSIONS).values():
-        _scalar(value)
-    for value in document.items().values():
-        if not isinstance(value.value, dict | list):
-            _scalar(value)
-    _refined(document)
-    mesh = document.get("mesh", {})
-    mesh.get("size", [0.0, 0.0, 0.0]).vector()
-    for kind in mesh.get("evidence", {}).items().values():
-        kind["share"].number()
-    return {key: value for key, value in report.items() if value is not None}
+    check_numbers(report, file, RUN_AGAIN)
+    as_type(report, _Report, file, RUN_AGAIN)
+    return _without_null(report)
 
 
-def _refined(document: JsonField) -> None:
-    """Check the rows about refined lights."""
-    trial = document.get("light_trial", {})
-    if trial.items():
-        trial["sentence"].text()
-        trial["accepted"].flag()
-    rows = document.get("refined_lights", []).entries(MOST_PHOTOS)
-    for row in rows:
-        row["photo"].file_name()
-        row["moved"].number()
-        row["sigmas"].number()
-        row["sigma"].vector()
-        for place in {"position", "direction"} & row.items().keys():
-            row[place].vector()
-    if len({"position" in row.items() for row in rows}) > 1:
-        raise document["refined_lights"].refuse("lights of one kind, all with a position or none, were")
+def _without_null(document: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in document.items() if value is not None}
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
@@ -88,18 +145,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
     Raises:
         CalibrationError: it cannot be read, is of another format, or a value is of another kind; names it.
     """
-    document = read_document(path, "Give another --out.")
-    manifest = document.any_numbers()
-    if manifest.get("format") != MANIFEST_FORMAT:
-        raise document["format"].refuse(f"format {MANIFEST_FORMAT}, which this version reads, was")
-    for value in document.get("inputs", {}).items().values():
-        value.text()
-    document.get("config", {}).items()
-    _costs(document.get("costs", {}))
-    for stage in document.get("finished", []).entries(MOST_STAGES):
-        stage.text()
-    _few(document.get("made_with", {}), MOST_STAGES)
-    return {"inputs": {}, "config": {}} | manifest
+    return {"inputs": {}, "config": {}} | read_as(path, _Manifest, "Give another --out.")[1]
 
 
 def read_check(path: Path) -> dict[str, Any]:
@@ -108,45 +154,7 @@ def read_check(path: Path) -> dict[str, Any]:
     Raises:
         CalibrationError: it cannot be read, or a value is of another kind; names it.
     """
-    document = read_document(path, RUN_AGAIN)
-    for name in ("reasons", "advice"):
-        for line in document.get(name, []).entries():
-            line.text()
-    for name in ("verdict", "sentence"):
-        document.get(name, "").text()
-    for row in document.get("lights", []).entries(MOST_PHOTOS):
-        row["photo"].file_name()
-        row["used"].flag()
-        row["azimuth"].number(most=FULL_TURN)
-        row["elevation"].number(most=FULL_TURN)
-    for row in document.get("findings", []).entries(MOST_PHOTOS):
-        for name in ("photo", "kind", "text"):
-            row[name].text()
-    return {"reasons": [], "advice": []} | document.any_numbers()
-
-
-def _costs(field: JsonField) -> None:
-    for cost in _few(field, MOST_STAGES).values():
-        for name, value in cost.items().items():
-            if name not in ("seconds", "cpu_seconds", "peak_memory_bytes"):
-                raise value.refuse("seconds, cpu_seconds or peak_memory_bytes were")
-            if value.number(most=LARGEST_COUNT) < 0:
-                raise value.refuse("a number from 0 was")
-
-
-def _few(field: JsonField, most: int) -> dict[str, JsonField]:
-    found = field.items()
-    if len(found) > most:
-        raise CaptureError(f"{field.file}: {field.name} has {len(found)} entries, at most {most} were needed.")
-    return found
-
-
-def _scalar(field: JsonField) -> None:
-    """Check a value that is shown as it stands: a short text, a number, true, false or null."""
-    if isinstance(field.value, str):
-        field.text()
-    elif field.value is not None and type(field.value) is not bool:
-        field.number()
+    return {"reasons": [], "advice": []} | _without_null(read_as(path, _Check, RUN_AGAIN)[1])
 
 
 # --- the log ---------------------------------------------------------------------------------------------------------

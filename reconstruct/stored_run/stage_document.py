@@ -1,25 +1,83 @@
 """Read and write stage.json: notes, saved views and the way a finished run is shown; it may be a stranger's."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct
 
 from capture.errors import CalibrationError
 from capture.files.atomic import parse_json, write_json
-from capture.files.json_field import JsonField, read_document
 from capture.files.regular import why
+from capture.files.schema import Number, as_type, read_as
 
 STAGE = "stage.json"
 FORMAT = 1
 LARGEST = 1 << 20  # bytes
 MOST_NOTES, MOST_VIEWS = 500, 200
 LONGEST_NOTE = 500  # letters
-KINDS = ("arrow", "length")
-GUESS = ("shown", "marked", "cut")
 LARGEST_LENGTH = 1e9  # world length
 ADVICE = "Remove it, or ask for the folder again."
 EMPTY: dict[str, Any] = {"format": FORMAT, "notes": [], "views": [], "crop": None, "guess": "shown", "smooth": 0.0}
-VIEW = ("azimuth", "elevation", "distance", "focal")
-LAMP = ("azimuth", "elevation", "distance", "radius", "strength")
+Coordinate = Annotated[float, Meta(ge=-LARGEST_LENGTH, le=LARGEST_LENGTH)]
+Place = Annotated[list[Coordinate], Meta(min_length=3, max_length=3, description="a list of 3 numbers")]
+Words = Annotated[str, Meta(max_length=LONGEST_NOTE)]
+
+
+class _Arrow(Struct, tag_field="kind", tag="arrow"):
+    text: Words
+    at: Place
+    normal: Place
+
+
+class _Length(Struct, tag_field="kind", tag="length"):
+    text: Words
+    at: Place
+    normal: Place
+    to: Place
+
+
+class _Seen(Struct):
+    azimuth: Coordinate
+    elevation: Coordinate
+    distance: Coordinate
+    focal: Coordinate
+    shift: Annotated[list[Number], Meta(min_length=2, max_length=2, description="a list of 2 numbers")]
+
+
+class _Lamp(Struct):
+    azimuth: Coordinate
+    elevation: Coordinate
+    distance: Coordinate
+    radius: Coordinate
+    strength: Coordinate
+
+
+class _View(Struct):
+    name: Words
+    view: _Seen
+    lamp: _Lamp
+    look: Words = "photo"
+
+
+class _Crop(Struct):
+    low: Place
+    high: Place
+
+    def __post_init__(self) -> None:
+        if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
+            raise ValueError(f"low is {self.low} and high {self.high}; needed: a box with low below high")
+
+
+class _Stage(Struct):
+    """stage.json."""
+
+    format: Annotated[Literal[1], Meta(description="format 1, which this version reads")]
+    notes: Annotated[list[_Arrow | _Length], Meta(max_length=MOST_NOTES)] = []
+    views: Annotated[list[_View], Meta(max_length=MOST_VIEWS)] = []
+    crop: _Crop | None = None
+    guess: Literal["shown", "marked", "cut"] = "shown"
+    smooth: Annotated[float, Meta(ge=0, le=LARGEST_LENGTH, description="a length from 0")] = 0.0
 
 
 def read_stage_document(run_dir: Path) -> dict[str, Any] | None:
@@ -31,7 +89,7 @@ def read_stage_document(run_dir: Path) -> dict[str, Any] | None:
     path = run_dir / STAGE
     if not path.exists() and not path.is_symlink():
         return None
-    return checked_stage(read_document(path, ADVICE))
+    return msgspec.to_builtins(read_as(path, _Stage, ADVICE)[0])
 
 
 def save_stage_document(run_dir: Path, content: bytes) -> None:
@@ -45,7 +103,7 @@ def save_stage_document(run_dir: Path, content: bytes) -> None:
 
 
 def parsed_stage(content: bytes) -> dict[str, Any]:
-    """Return the document in some bytes after the check of `checked_stage`.
+    """Return the document in some bytes, of which only what is known is kept.
 
     Raises:
         CalibrationError: it is none; names the value that is at fault.
@@ -56,66 +114,4 @@ def parsed_stage(content: bytes) -> dict[str, Any]:
         value = parse_json(content.decode("utf-8"))
     except ValueError as error:
         raise CalibrationError(f"{STAGE} is not JSON ({why(error)}). Send the document again.") from error
-    return checked_stage(JsonField(value, STAGE, "", "Send the document again."))
-
-
-def checked_stage(document: JsonField) -> dict[str, Any]:
-    """Return a document of which only what is known is kept.
-
-    Raises:
-        CalibrationError: it is of another format, or a value is of another kind; names it.
-    """
-    if document["format"].value != FORMAT:
-        raise document["format"].refuse(f"format {FORMAT}, which this version reads, was")
-    crop = document.get("crop", None)
-    return {
-        "format": FORMAT,
-        "notes": [_note(field) for field in document.get("notes", []).entries(MOST_NOTES)],
-        "views": [_view(field) for field in document.get("views", []).entries(MOST_VIEWS)],
-        "crop": None if crop.value is None else _crop(crop),
-        "guess": document.get("guess", "shown").text(*GUESS),
-        "smooth": _length(document.get("smooth", 0.0)),
-    }
-
-
-def _note(field: JsonField) -> dict[str, Any]:
-    kind = field["kind"].text(*KINDS)
-    note = {"kind": kind, "text": _words(field["text"]), "at": _place(field["at"]), "normal": _place(field["normal"])}
-    return note | ({"to": _place(field["to"])} if kind == "length" else {})
-
-
-def _view(field: JsonField) -> dict[str, Any]:
-    view, lamp = field["view"], field["lamp"]
-    return {
-        "name": _words(field["name"]),
-        "view": {name: view[name].number(most=LARGEST_LENGTH) for name in VIEW} | {"shift": view["shift"].numbers(2)},
-        "lamp": {name: lamp[name].number(most=LARGEST_LENGTH) for name in LAMP},
-        "look": _words(field.get("look", "photo")),
-    }
-
-
-def _crop(field: JsonField) -> dict[str, Any]:
-    low, high = _place(field["low"]), _place(field["high"])
-    if not all(a < b for a, b in zip(low, high, strict=True)):
-        raise field.refuse("a box with low below high was")
-    return {"low": low, "high": high}
-
-
-def _place(field: JsonField) -> list[float]:
-    if len(field.entries()) != 3:
-        raise field.refuse("a list of 3 numbers was")
-    return [entry.number(most=LARGEST_LENGTH) for entry in field.entries()]
-
-
-def _length(field: JsonField) -> float:
-    value = field.number(most=LARGEST_LENGTH)
-    if value < 0:
-        raise field.refuse("a length from 0 was")
-    return value
-
-
-def _words(field: JsonField) -> str:
-    text = field.text()
-    if len(text) > LONGEST_NOTE:
-        raise field.refuse(f"a text of at most {LONGEST_NOTE} letters was")
-    return text
+    return msgspec.to_builtins(as_type(value, _Stage, STAGE, "Send the document again."))

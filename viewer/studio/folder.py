@@ -4,11 +4,13 @@ import secrets
 import shutil
 from pathlib import Path
 
+from msgspec import Struct
+
 from capture.errors import CaptureError, UserError
 from capture.files.atomic import read_json, write_json
-from capture.files.json_field import JsonField
 from capture.files.names import is_shown
 from capture.files.regular import is_own_folder
+from capture.files.schema import Text, as_type
 from capture.files.title import as_name, keep_title
 from reconstruct.run.batch import looks_like_capture
 from reconstruct.run_folder.folder import LOG
@@ -22,6 +24,14 @@ PRIVATE = 0o700
 MOST_LOOKED_INTO = 50  # folders, to find out whether a folder is one for a studio
 MOST_FOLDERS = 2_000  # that are looked at
 DEEPEST = 4  # levels below the folder at which a person may choose one
+
+
+class _Address(Struct):
+    address: Text
+
+
+class _Token(Struct):
+    token: Text
 
 
 class StudioFolder:
@@ -73,7 +83,7 @@ class StudioFolder:
         if lock_holder(self.kept / LOCK) is None:
             return None
         try:
-            return JsonField(read_json(self.kept / ADDRESS), ADDRESS)["address"].text()
+            return as_type(read_json(self.kept / ADDRESS), _Address, ADDRESS).address
         except (OSError, ValueError, UserError):
             return None
 
@@ -85,7 +95,7 @@ class StudioFolder:
         """Return the secret of the address; it stays the same, so that an open page survives a restart."""
         path = self.kept / "token.json"
         try:
-            token = JsonField(read_json(path), str(path))["token"].text()
+            token = as_type(read_json(path), _Token, str(path)).token
             if len(token) >= TOKEN_BYTES:
                 return token
         except (OSError, ValueError, UserError):
@@ -199,7 +209,8 @@ class StudioFolder:
 
     def _keys_added(self) -> list[str]:
         try:
-            return [key.text() for key in JsonField(read_json(self.kept / ADDED), ADDED).entries()]
+            found = read_json(self.kept / ADDED)
+            return [key for key in found if isinstance(key, str)] if isinstance(found, list) else []
         except (OSError, ValueError, UserError):
             return []
 

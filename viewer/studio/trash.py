@@ -9,7 +9,7 @@ from pathlib import Path
 
 from capture.errors import CaptureError, UserError
 from capture.files.atomic import read_json, write_json
-from capture.files.json_field import JsonField
+from capture.files.schema import Count, FileName, Number, Text, as_type
 from viewer.studio.folder import KEPT
 
 NOTE = "note.json"
@@ -19,11 +19,11 @@ NOTE = "note.json"
 class Deleted:
     """One thing in the trash."""
 
-    id: str
-    key: str  # where it was, relative to the studio's folder
-    title: str
-    when: float  # seconds since 1970
-    bytes: int
+    id: FileName
+    key: Text  # where it was, relative to the studio's folder
+    title: Text
+    when: Number  # seconds since 1970
+    bytes: Count
 
 
 class Trash:
@@ -81,9 +81,6 @@ class Trash:
 
 def _read(path: Path) -> Deleted | None:
     try:
-        row = JsonField(read_json(path), str(path))
-        return Deleted(
-            row["id"].file_name(), row["key"].text(), row["title"].text(), row["when"].number(), row["bytes"].count(0)
-        )
+        return as_type(read_json(path), Deleted, str(path))
     except (OSError, ValueError, UserError):
         return None

@@ -14,22 +14,24 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import psutil
 import segno
 import uvicorn
+from msgspec import Meta, Struct
 from starlette.types import ASGIApp
 
 from capture.errors import CaptureError, UserError
 from capture.files.atomic import read_json, write_json
-from capture.files.json_field import JsonField
 from capture.files.names import in_one_line
+from capture.files.schema import Number, Text, as_type
 from viewer.studio.sockets import free_socket, http_server
 from viewer.studio_server.certificate import make_certificate
 
 EVERYWHERE = "0.0.0.0"
 FIRST_PORT = 8490
+Port = Annotated[int, Meta(ge=0, le=65535)]
 OPEN_S = 2 * 3600.0  # seconds that the switch stays on
 TOKEN_BYTES = 16
 MOST_PHONES = 12
@@ -41,11 +43,11 @@ LONGEST_NAME = 60  # letters
 class Phone:
     """One phone that was let in."""
 
-    secret: str
-    name: str
-    role: str = ""  # "camera" | "light" in live mode
-    joined: float = 0.0  # seconds since 1970
-    seen: float = 0.0
+    secret: Text
+    name: Text
+    role: Text = ""  # "camera" | "light" in live mode
+    joined: Number = 0.0  # seconds since 1970
+    seen: Number = 0.0
 
     @property
     def id(self) -> str:
@@ -63,6 +65,16 @@ class Door:
     ports: tuple[int, int] = (0, 0)  # http, https
     phones: dict[str, Phone] = field(default_factory=dict)  # by secret
     shots: int = 0  # that the owner's page has asked for: a live camera takes one when it grows
+
+
+class _Kept(Struct):
+    """The file that a switch that is on leaves."""
+
+    capture: Text
+    until: Number
+    token: Text
+    ports: tuple[Port, Port]
+    phones: tuple[Phone, ...]
 
 
 class Phones:
@@ -254,18 +266,7 @@ def own_addresses() -> list[str]:
 
 def _read(file: Path) -> Door | None:
     try:
-        row = JsonField(read_json(file), str(file))
-        phones = [
-            Phone(one["secret"].text(), one["name"].text(), one["role"].text(), one["joined"].number(), 0.0)
-            for one in row["phones"].entries()
-        ]
-        ports = row["ports"].entries()
-        return Door(
-            row["capture"].text(),
-            row["until"].number(),
-            row["token"].text(),
-            (ports[0].count(0, 65535), ports[1].count(0, 65535)),
-            {phone.secret: phone for phone in phones},
-        )
-    except (OSError, ValueError, IndexError, UserError):
+        kept = as_type(read_json(file), _Kept, str(file))
+        return Door(kept.capture, kept.until, kept.token, kept.ports, {phone.secret: phone for phone in kept.phones})
+    except (OSError, ValueError, UserError):
         return None
