@@ -16,7 +16,7 @@ from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import find_surface, visibility
 from reconstruct.solve.ray_operators import DrawnRays, RayOperators
 from reconstruct.torch_sdf import equations as render
-from reconstruct.torch_sdf.autograd import FirstIntersection, ShadowRenderer, transmittance
+from reconstruct.torch_sdf.autograd import ShadowRenderer, first_intersections, transmittance
 
 NODES, SPACING = 36, 0.25
 ORIGIN = torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
@@ -114,7 +114,7 @@ def camera(count: int = 1500) -> tuple[Tensor, Tensor, Tensor]:
 def test_intersections_lie_on_the_ball_and_move_with_it():
     growth = torch.zeros((), dtype=torch.float64, requires_grad=True)
     eye, directions, ground_t = camera()
-    found = FirstIntersection(1e-3)(ball(RADIUS + growth), eye.expand_as(directions), directions, ground_t)
+    found = first_intersections(ball(RADIUS + growth), eye.expand_as(directions), directions, ground_t, 1e-3)
     t = find_surface(ball(real=torch.float32), eye.float().expand_as(directions).contiguous(), directions.float())
     hit = found.is_hit
     assert 0.2 < hit.double().mean() < 0.8
@@ -132,7 +132,7 @@ def test_intersections_lie_on_the_ball_and_move_with_it():
 def test_a_boundary_pixel_is_covered_by_as_much_of_the_ball_as_it_should_be():
     eye, directions, ground_t = camera(6000)
     angle = 0.05
-    found = FirstIntersection(angle)(ball(), eye.expand_as(directions), directions, ground_t)
+    found = first_intersections(ball(), eye.expand_as(directions), directions, ground_t, angle)
     edge = found.is_edge & ~found.is_hit
     assert edge.sum() > 100
     along = ((CENTRE - eye) * directions).sum(-1)

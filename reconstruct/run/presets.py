@@ -46,7 +46,7 @@ def continued(config: FitConfig, done: int, name: str) -> FitConfig | None:
 
 
 def without(config: FitConfig, ablate: str | None) -> FitConfig:
-    """Return the settings with one part of the method, named in train_config.ABLATIONS, switched off."""
+    """Return the settings with one part of the method, named in ABLATIONS of its config, switched off."""
     changes: dict[str | None, dict[str, Any]] = {
         "intersection": {"use_start_gradient": False},
         "boundary": {"use_boundary": False},

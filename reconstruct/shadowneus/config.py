@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 from reconstruct.shadowneus.hash_field import HashLevels
 from reconstruct.shadowneus.mlp_field import Network
 
-ABLATIONS = {
-    "intersection": "no differentiable intersection: shadow rays start at fixed points",
-    "boundary": "no second depth at boundary pixels",
-    "expected-depth": "shadow rays start at the expected depth of camera rays instead of their intersection",
-    "foreground-only": "shadows on the object alone",
-    "background-only": "shadows on the ground alone",
-    "sampled": "visibility from samples along the shadow ray",
-    "telescoped": "visibility in closed form, from the extrema of the shadow ray",
+ABLATIONS: dict[str, dict[str, bool | str]] = {  # what each changes of a TrainConfig
+    "intersection": {"use_moved_intersection": False},
+    "boundary": {"use_boundary": False},
+    "expected-depth": {"use_expected_depth": True},
+    "foreground-only": {"supervised": "foreground"},
+    "background-only": {"supervised": "background"},
+    "sampled": {"use_telescoped": False},
+    "telescoped": {"use_telescoped": True},
 }
 
 
@@ -73,16 +73,7 @@ class TrainConfig:
 
 def ablated(config: TrainConfig, name: str) -> TrainConfig:
     """Return the settings with one part of the method changed; `name` is one of ABLATIONS."""
-    changes = {
-        "intersection": {"use_moved_intersection": False},
-        "boundary": {"use_boundary": False},
-        "expected-depth": {"use_expected_depth": True},
-        "foreground-only": {"supervised": "foreground"},
-        "background-only": {"supervised": "background"},
-        "sampled": {"use_telescoped": False},
-        "telescoped": {"use_telescoped": True},
-    }
-    return replace(config, **changes[name])
+    return replace(config, **ABLATIONS[name])
 
 
 def shortened_training(config: TrainConfig, iterations: int) -> TrainConfig:

@@ -199,46 +199,41 @@ class Intersections:
     edge_ratio: Float[Tensor, " n"]  # share of the pixel that it covers, differentiable; 0 without an edge
 
 
-class FirstIntersection(nn.Module):
-    """The first surface that camera rays meet, differentiable [ShadowNeuS eq:diff_intersect, eq:edge_vis].
+def first_intersections(
+    grid: SdfGrid,
+    origins: Float[Tensor, "n 3"],
+    directions: Float[Tensor, "n 3"],
+    far: Float[Tensor, " n"],
+    pixel_angle: float,
+) -> Intersections:
+    """Return the first surface that camera rays meet, differentiable [ShadowNeuS eq:diff_intersect, eq:edge_vis].
 
     A point moves along its ray as the SDF there changes; the area ratio of a boundary pixel changes with the SDF at its
-    silhouette. Rays are constants.
+    silhouette. Rays are constants. World frame; the rays are marched on the CPU.
+
+    Args:
+        directions: unit.
+        far: length at which each ray ends; inf if it does not end.
+        pixel_angle: that a pixel subtends, radians.
     """
+    field = DifferentiableSdf.of(grid.values / grid.spacing)
+    starts, end = (origins - grid.origin.to(origins)) / grid.spacing, (far / grid.spacing).clamp(max=10 * FAR)
+    rays = (x.detach().double().cpu().numpy() for x in (starts, directions, end))
+    blocks = overlapping(pack(field.volume.phi.float().cpu().numpy()))
+    hit, part_t, _ = (torch.from_numpy(x).to(far) for x in first_surfaces(blocks, *rays, pixel_angle))
+    is_hit, is_edge = hit < FAR, part_t > 0
 
-    def __init__(self, pixel_angle: float):
-        """Set the angle that a pixel subtends, radians."""
-        super().__init__()
-        self.pixel_angle = pixel_angle
+    at_hit = starts + torch.where(is_hit, hit, 0.0)[:, None] * directions
+    at_edge = starts + torch.where(is_edge, part_t, 0.0)[:, None] * directions
+    normals = field.volume.gradient(at_hit)
+    moved = moved_intersection(at_hit, directions, field.sample(at_hit), normals)
+    footprint = torch.where(is_edge, pixel_angle * part_t, 1.0)
+    ratio = torch.where(is_edge, area_ratio(field.sample(at_edge), footprint), 0.0)
 
-    def forward(
-        self, grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, " n"]
-    ) -> Intersections:
-        """Return the intersections of rays with the surface, world frame.
+    def in_world(p: Tensor) -> Tensor:
+        return p * grid.spacing + grid.origin.to(p)
 
-        Args:
-            origins: world.
-            directions: unit, world.
-            far: length at which each ray ends, world; inf if it does not end.
-        """
-        field = DifferentiableSdf.of(grid.values / grid.spacing)
-        starts, end = (origins - grid.origin.to(origins)) / grid.spacing, (far / grid.spacing).clamp(max=10 * FAR)
-        rays = (x.detach().double().cpu().numpy() for x in (starts, directions, end))
-        blocks = overlapping(pack(field.volume.phi.float().cpu().numpy()))
-        hit, part_t, _ = (torch.from_numpy(x).to(far) for x in first_surfaces(blocks, *rays, self.pixel_angle))
-        is_hit, is_edge = hit < FAR, part_t > 0
-
-        at_hit = starts + torch.where(is_hit, hit, 0.0)[:, None] * directions
-        at_edge = starts + torch.where(is_edge, part_t, 0.0)[:, None] * directions
-        normals = field.volume.gradient(at_hit)
-        moved = moved_intersection(at_hit, directions, field.sample(at_hit), normals)
-        footprint = torch.where(is_edge, self.pixel_angle * part_t, 1.0)
-        ratio = torch.where(is_edge, area_ratio(field.sample(at_edge), footprint), 0.0)
-
-        def in_world(p: Tensor) -> Tensor:
-            return p * grid.spacing + grid.origin.to(p)
-
-        return Intersections(is_hit, in_world(moved), normals, is_edge, in_world(at_edge), ratio)
+    return Intersections(is_hit, in_world(moved), normals, is_edge, in_world(at_edge), ratio)
 
 
 @dataclass(frozen=True)
@@ -267,7 +262,7 @@ class ShadowRenderer(nn.Module):
             use_boundary: blend two depths at boundary pixels.
         """
         super().__init__()
-        self.intersect = FirstIntersection(pixel_angle)
+        self.pixel_angle = pixel_angle
         self.log_sharpness = nn.Parameter(torch.tensor(float(sharpness)).log())
         self.use_boundary = use_boundary
 
@@ -287,7 +282,7 @@ class ShadowRenderer(nn.Module):
             ground_t: distance to the ground, world length; inf where a ray does not meet it.
             lights: one per pixel, homogeneous, world.
         """
-        found = self.intersect(grid, eye.expand_as(directions), directions, ground_t)
+        found = first_intersections(grid, eye.expand_as(directions), directions, ground_t, self.pixel_angle)
         on_ground = eye + torch.where(ground_t.isfinite(), ground_t, 0.0)[:, None] * directions
         points = torch.where(found.is_hit[:, None], found.points, on_ground)
         up = torch.tensor([0.0, 0.0, 1.0]).to(points)
