@@ -4,6 +4,8 @@ Beams with a hot centre, and phones that change the brightness from place to pla
 reconstruct.labels.ground_test could call ground. The field of calibration.ground follows both.
 """
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import torch
@@ -12,7 +14,8 @@ from scipy.ndimage import label, mean
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
+from calibration.ground.ground_field import DARK as SHADOW
+from calibration.ground.ground_field import DARKEST, GroundField, at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import LIKELY, BareGround, bare_ground
 from calibration.ground.table_edges import seen_beyond
 from reconstruct.labels.ground_test import (
@@ -54,10 +57,10 @@ AMBIENT_SHARE = 0.7  # of the light in shadows on the ground: the rest comes fro
 def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     """Classify pixels as object or ground, and label the shadows on it: by the lights' model, or by a field of light.
 
-    The field is used where the model makes much less of the picture ground than the field does. Where both explain what
-    lies before the ground's end, both tell the outline, see _common_outline, and the photos' powers decide whose
-    light is right, see _powers_off. How quiet the fits are is no evidence: the field bends to what it is fitted to, and
-    so do the model's gains.
+    The field is used where the model makes much less of the picture ground than the field does. Elsewhere both tell the
+    outline, see _common_outline, or the field alone where the model explains less than EXPLAINED, and the photos'
+    powers decide whose light is right, see _powers_off. How quiet the fits are is no evidence: the field bends to what
+    it is fitted to, and so do the model's gains.
 
     Args:
         before: of the same photos under other lights; what does not depend on them is taken from it.
@@ -79,23 +82,29 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     rgb, usable = scene.rgb.numpy(), scene.usable.numpy()
     points, eye = ground_points(scene).double().numpy(), scene.eye.double().numpy()
     beyond = seen_beyond(rgb, usable, points, eye)
-    if beyond is None and tested.explained >= EXPLAINED:
-        return tested
     field = at_photo_size(fit_ground_field(rgb, usable, beyond), rgb, usable)
-    bare = bare_ground(field)
+    bare = bare_ground(_with_dark_samples(field, usable))
     # Beyond the ground's end, too, light is smooth and shadows fall, but on no ground.
     background = None if beyond is None else torch.from_numpy(beyond & ~bare.shadows.object_mask)
     by_model = tested if background is None else test_ground(scene, background)
     share = float((field.follows > FOLLOWS).mean())
-    if by_model.explained < EXPLAINED:
-        has_more = share > tested.explained + GAINED
-        return _by_field(scene, bare) if has_more else by_model
+    is_explained = by_model.explained >= EXPLAINED
+    if not is_explained and share > tested.explained + GAINED:
+        return _by_field(scene, bare)
     if share < EXPLAINED:
         return by_model
-    outline = _common_outline(scene, by_model, bare)
+    outline = _common_outline(scene, by_model, bare) if is_explained else _mask(scene, bare)
     if _powers_off(scene, field, by_model) < POWERS_OFF:
         return test_ground(scene, background, outline)
     return _by_field(scene, bare, outline)
+
+
+def _with_dark_samples(field: GroundField, usable: Bool[np.ndarray, "photos height width"]) -> GroundField:
+    """Return the field with the samples too that are too dark to measure where lit ground would not be: shadows."""
+    lit = field.albedo + field.light
+    dark = usable & ~field.usable & (lit + SHADOW > np.log(DARKEST))
+    residual = np.where(dark, np.log(DARKEST) - lit, field.residual).astype(np.float32)
+    return replace(field, usable=field.usable | dark, residual=residual)
 
 
 def _powers_off(scene: Scene, field: GroundField, tested: GroundTest) -> float:
