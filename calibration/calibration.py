@@ -17,6 +17,7 @@ from calibration.side_view import LARGEST, SideView, from_run_lengths, run_lengt
 from capture.decode.limits import PIXEL_CAP
 from capture.files.atomic import write_json
 from capture.files.json_field import UNIT_ATOL, JsonField, read_document
+from capture.files.schema import check_numbers
 
 FORMAT = 1
 UNITS = ("mm", "scene")
@@ -249,7 +250,8 @@ def _side_view(one: JsonField, ground_height: float) -> SideView:
 
 def _residuals(field: JsonField) -> dict[str, Any]:
     """Return the residuals after a check of those that are read as lists, tables or numbers."""
-    found = field.any_numbers()
+    field.items()
+    check_numbers(field.value, field.file, field.advice, field.name)
     for name in ("notes", "warnings"):
         for line in field.get(name, []).entries():
             line.text()
@@ -265,7 +267,7 @@ def _residuals(field: JsonField) -> dict[str, Any]:
         row["photo"].file_name()
         for name in ("role", "reason"):
             row[name].text()
-    return found
+    return field.value
 
 
 def _ground_height(ground: JsonField) -> float:

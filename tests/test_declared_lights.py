@@ -147,7 +147,7 @@ turn_deg = 90
     ("text", "message"),
     [
         ('light = "lamp"', "light is 'lamp'; needed: flashlight or sun"),
-        ("lights_at_once = 9", "lights_at_once is 9; needed: a whole number from 1 to 4"),
+        ("lights_at_once = 9", "lights_at_once is 9; needed: a whole number of at most 4"),
         ("[[pegs]]\nat_mm = [1, 2]\nheight_mm = 0\ndiameter_mm = 5", r"pegs\[0\].height_mm is 0; needed: a length"),
         ("[[pegs]]\nat_mm = [1]\nheight_mm = 5\ndiameter_mm = 5", "x and y on the board"),
         ("[[cubes]]\nat_mm = [1, 2]\nheight_mm = 5", "unknown entry 'height_mm'"),

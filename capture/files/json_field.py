@@ -10,16 +10,19 @@ from jaxtyping import Float
 
 from capture.errors import CalibrationError
 from capture.files.atomic import parse_json
-from capture.files.regular import read_regular, why
+from capture.files.regular import why
+from capture.files.schema import (
+    CORRECT,
+    LARGEST_FILE,
+    LARGEST_NUMBER,
+    LONGEST_NAME,
+    LONGEST_TEXT,
+    MOST_ENTRIES,
+    read_value,
+)
 
 Vector = Float[np.ndarray, "3"]
-LARGEST_FILE = 64 * 2**20  # bytes: the lights of a hundred thousand photos
 UNIT_ATOL = 1e-6  # directions are computed in float64 and written in full
-LONGEST_NAME = 255  # letters of a file's name
-LONGEST_TEXT = 10_000  # letters of a sentence
-MOST_ENTRIES = 100_000  # of a list or an object
-LARGEST_NUMBER = 1e15  # beyond, float64 holds no halves, and products of a few numbers soon overflow
-CORRECT = "Calibrate again, or correct the file."
 
 
 @dataclass(frozen=True)
@@ -130,22 +133,6 @@ class JsonField:
             raise self.refuse("a direction of length 1 was")
         return vector
 
-    def any_numbers(self) -> dict[str, Any]:
-        """Return the object after a check that every number in it, at any depth, is finite."""
-        self.items()
-        self._refuse_nan()
-        return self.value
-
-    def _refuse_nan(self) -> None:
-        if isinstance(self.value, dict):
-            for entry in self.items().values():
-                entry._refuse_nan()
-        elif isinstance(self.value, list):
-            for entry in self.entries():
-                entry._refuse_nan()
-        elif isinstance(self.value, float) and not np.isfinite(self.value):
-            raise self.refuse("a finite number was")
-
 
 def _is_finite(value: int | float) -> bool:
     """Return whether a float can hold the number; whole numbers in JSON can be of any length."""
@@ -190,10 +177,7 @@ def read_document(path: Path, advice: str = CORRECT) -> JsonField:
     Raises:
         CalibrationError: it is no regular file, is too large, or is not JSON.
     """
-    try:
-        return JsonField(parse_json(read_regular(path, LARGEST_FILE).decode("utf-8-sig")), str(path), "", advice)
-    except (OSError, ValueError) as error:
-        raise CalibrationError(f"{path} cannot be read as JSON ({why(error)}). {advice}") from error
+    return JsonField(read_value(path, advice), str(path), "", advice)
 
 
 def read_object(path: Path, member: str) -> dict[str, Any]:

@@ -61,13 +61,13 @@ def as_type(
         raise error(f"{file}: {_fault(said, own, place, value, kind)}. {advice}".rstrip()) from None
 
 
-def check_numbers(value: Any, file: str, advice: str = CORRECT) -> None:
+def check_numbers(value: Any, file: str, advice: str = CORRECT, name: str = "") -> None:
     """Check that every number in a value, at any depth, is one that a float can hold.
 
     Raises:
         CalibrationError: one is not; names its place.
     """
-    left = [("", value)]
+    left = [(name, value)]
     while left:
         place, one = left.pop()
         if isinstance(one, dict):
@@ -78,16 +78,25 @@ def check_numbers(value: Any, file: str, advice: str = CORRECT) -> None:
             raise CalibrationError(f"{file}: {place or 'the file'} is {one!s:.80}; needed: a finite number. {advice}")
 
 
+def read_value(path: Path, advice: str = CORRECT) -> Any:
+    """Return the content of a JSON file of a run folder, which may be a stranger's.
+
+    Raises:
+        CalibrationError: it is no regular file, is too large, or is not JSON.
+    """
+    try:
+        return parse_json(read_regular(path, LARGEST_FILE).decode("utf-8-sig"))
+    except (OSError, ValueError) as error:
+        raise CalibrationError(f"{path} cannot be read as JSON ({why(error)}). {advice}") from error
+
+
 def read_as(path: Path, kind: type[Kind], advice: str = CORRECT) -> tuple[Kind, Any]:
     """Return the JSON file of a run folder, which may be a stranger's, as a type, and as it stands.
 
     Raises:
         CalibrationError: it is no regular file, is too large, is not JSON, or a value is of another type; names it.
     """
-    try:
-        value = parse_json(read_regular(path, LARGEST_FILE).decode("utf-8-sig"))
-    except (OSError, ValueError) as error:
-        raise CalibrationError(f"{path} cannot be read as JSON ({why(error)}). {advice}") from error
+    value = read_value(path, advice)
     check_numbers(value, str(path), advice)
     return as_type(value, kind, str(path), advice), value
 

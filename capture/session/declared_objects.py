@@ -18,6 +18,8 @@ LEAST_HEIGHT_SIGMA = 0.5  # mm: a ruler's division, and where the highest point 
 
 Length = Annotated[Positive, Meta(description="a length in millimetres")]
 OnBoard = Annotated[tuple[Number, Number], Meta(description="x and y on the board in millimetres")]
+_FROM_TABLE = f"millimetres from the table to the board's printed side, 0 to {THICKEST_BOARD:g}"
+Thickness = Annotated[float, Meta(ge=0, le=THICKEST_BOARD, description=_FROM_TABLE)]
 Pixel = Annotated[tuple[Number, Number], Meta(description="two numbers in pixels")]
 
 

@@ -20,12 +20,12 @@ from capture.photos.finding import Finding, grouped
 from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
 from capture.session.declared_objects import (
     MOST_LIGHTS,
-    THICKEST_BOARD,
     Cube,
     DeclaredObjects,
     Height,
     Peg,
     PhoneBack,
+    Thickness,
     parse_height,
 )
 from capture.session.roles import NoBoardError, Roles
@@ -80,20 +80,11 @@ class _SessionFile(Struct, forbid_unknown_fields=True):
         dict[Literal["board", "lit", "light", "dark", "side"], list[str]],
         Meta(description="lists of file names under board, lit, light, dark or side"),
     ] = msgspec.field(default_factory=dict)
-    clip_frames: Annotated[
-        int,
-        Meta(
-            ge=FEWEST_LIT,
-            le=MOST_CLIP_FRAMES,
-            description=f"a whole number from {FEWEST_LIT} to {MOST_CLIP_FRAMES}",
-        ),
-    ] = CLIP_FRAMES
+    clip_frames: Annotated[int, Meta(ge=FEWEST_LIT, le=MOST_CLIP_FRAMES)] = CLIP_FRAMES
     pegs: tuple[Peg, ...] = ()
     cubes: tuple[Cube, ...] = ()
     light: Literal["flashlight", "sun"] = "flashlight"
-    lights_at_once: Annotated[
-        int, Meta(ge=1, le=MOST_LIGHTS, description=f"a whole number from 1 to {MOST_LIGHTS}")
-    ] = 1
+    lights_at_once: Annotated[int, Meta(ge=1, le=MOST_LIGHTS)] = 1
     phone_back: PhoneBack = PhoneBack()
     ball: (
         Annotated[
@@ -104,20 +95,7 @@ class _SessionFile(Struct, forbid_unknown_fields=True):
     ) = None
     scale: Any = None  # a text, see parse_length
     height: Any = None  # a number or a text, see parse_height
-    board_thickness_mm: (
-        Annotated[
-            float,
-            Meta(
-                ge=0,
-                le=THICKEST_BOARD,
-                description=(
-                    f"millimetres from the table to the board's printed side, 0 to {THICKEST_BOARD:g}, measured with "
-                    "what it is glued to; 0: the object stands on it"
-                ),
-            ),
-        ]
-        | None
-    ) = None
+    board_thickness_mm: Thickness | None = None
 
 
 @dataclass(frozen=True)

@@ -30,10 +30,7 @@ class _Arrow(Struct, tag_field="kind", tag="arrow"):
     normal: Place
 
 
-class _Length(Struct, tag_field="kind", tag="length"):
-    text: Words
-    at: Place
-    normal: Place
+class _Length(_Arrow, tag_field="kind", tag="length"):
     to: Place
 
 

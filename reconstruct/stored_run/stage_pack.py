@@ -18,6 +18,7 @@ from capture.errors import CaptureError
 from capture.files.atomic import parse_json
 from capture.files.json_field import JsonField
 from capture.files.regular import open_regular, read_regular
+from capture.files.schema import check_numbers
 
 STAGE_PACK, FACTS = "stage.zip", "facts.json"
 FORMAT = 5
@@ -60,7 +61,8 @@ class StagePack:
             part["count"].count(least=0, most=MOST_NUMBERS)
             part["offset"].count(least=0)
         document["size"].text()
-        self.facts: dict[str, Any] = document.any_numbers()
+        check_numbers(document.value, STAGE_PACK)
+        self.facts: dict[str, Any] = document.value
         self.names = tuple(name for name in entries if name != FACTS)
         addressed(self.facts, {name: name for name in self.names})
 
