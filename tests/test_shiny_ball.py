@@ -95,7 +95,7 @@ def test_a_named_ball_without_highlights_is_refused(tmp_path, photographed):
     with pytest.raises(CalibrationError, match=r"highlight in 0 of 8 photos, 4 were needed"):
         open_source(tmp_path, RunOptions())
     (tmp_path / "session.toml").write_text('ball = "left"\n')
-    with pytest.raises(CaptureError, match=r"ball is 'left'; \[x, y, radius\]"):
+    with pytest.raises(CaptureError, match=r"ball is 'left'; needed: \[x, y, radius\]"):
         open_source(tmp_path, RunOptions())
 
 
