@@ -14,8 +14,7 @@ from calibration.board.corners import find_board, grey_of
 from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.flashlight.fit import MIN_PHOTOS
-from calibration.flashlight.led_offset import BackView
-from calibration.flashlight.led_photo import read_phone_back
+from calibration.flashlight.led_photo import BackView, read_phone_back
 from calibration.flashlight.light_estimate import LightFit, locate_lights
 from calibration.flashlight.phone import MIN_VIEWS, PhoneViews, locate_lights_from_phone
 from calibration.flashlight.solids import fuse_shadow_lights, locate_sun

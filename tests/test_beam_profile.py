@@ -11,7 +11,6 @@ from calibration.flashlight.beam_profile import (
     log_gain,
     without_splines,
 )
-from calibration.flashlight.fit import _Search
 from calibration.flashlight.model import Evidence, Flashlights, Priors
 from calibration.lights.ground_cells import GroundCells
 
@@ -61,7 +60,8 @@ def test_what_is_expected_of_powers_beam_and_ambient_light_costs_one_at_one_sigm
     n, priors = len(places), Priors()
     ground = places - axes * places[:, 2:] / axes[:, 2:]
     power = np.r_[0.01, 1.0, np.linspace(-0.3, 0.3, n - 2)]
-    state = Flashlights(places, ground, power, np.array([1.0, 0.5, 0.2, -0.1]), 0.2, evidence.cells.centre)
+    wall = np.array([1.0, 6.0, 0.3])
+    state = Flashlights(places, ground, power, np.array([1.0, 0.5, 0.2, -0.1]), 0.2, evidence.cells.centre, wall)
     value, slope = model._prior_terms(state, evidence, priors)
     of_power = value[2 * n : 3 * n]
     np.testing.assert_allclose(of_power[0], 1, rtol=0.01)
@@ -74,17 +74,6 @@ def test_what_is_expected_of_powers_beam_and_ambient_light_costs_one_at_one_sigm
         step[column] = 1e-6
         ends = (model._prior_terms(state.moved(sign * step, 0.0), evidence, priors)[0] for sign in (1, -1))
         np.testing.assert_allclose((next(ends) - next(ends)) / 2e-6, slope[:, column], rtol=1e-4, atol=1e-6)
-
-
-def test_a_search_prefers_the_place_whose_power_is_that_of_the_others():
-    draw = np.random.default_rng(1)
-    far = draw.normal(0, 0.3, 200)
-    seen = far + draw.normal(0, 0.010, 200)
-    table = np.stack([seen + draw.normal(0, 0.007, 200) - 1.0, far])  # a little nearer, if it were e times as bright
-    search = _Search(np.array([[0.0, 0.0, 300.0], [0.0, 0.0, 500.0]]), table)
-    assert search.best(seen[None])[0].tolist() == [0]
-    index, power = search.best(seen[None], common=0.0)
-    assert index.tolist() == [1] and abs(power[0]) < 0.01
 
 
 def test_derivatives_of_the_profile_are_those_of_differences():

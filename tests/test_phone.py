@@ -9,7 +9,7 @@ from flashlight_photos import POSED_CAMERA, Recipe, handheld_lights, looking_at,
 from calibration.board.board import Board
 from calibration.board.corners import Corners
 from calibration.camera import Camera
-from calibration.flashlight.led_offset import BackView, LensReading
+from calibration.flashlight.led_photo import BackView, LensReading
 from calibration.flashlight.model import Flashlights
 from calibration.flashlight.phone import (
     PhoneViews,

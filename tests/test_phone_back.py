@@ -8,8 +8,7 @@ import pytest
 from board_photos import look_at
 from phone_backs import BOARD, BackOfPhone, back_photo, save_back
 
-from calibration.flashlight.led_offset import BackView, LensReading, choose, in_lens_frame
-from calibration.flashlight.led_photo import read_phone_back
+from calibration.flashlight.led_photo import BackView, LensReading, choose, in_lens_frame, read_phone_back
 from calibration.pose import Pose
 from capture.errors import CalibrationError, CaptureError
 from capture.session.declared_objects import PhoneBack

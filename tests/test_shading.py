@@ -29,6 +29,7 @@ from calibration.flashlight.model import (
     log_irradiance,
 )
 from calibration.flashlight.uncertainty import beam_error, unseen_error
+from calibration.flashlight.wall import WALL_TERMS
 from calibration.light import beam_gain, irradiance
 from calibration.lights.ground_cells import sample_ground
 from calibration.posed_camera import PosedCamera
@@ -110,7 +111,8 @@ def test_thejacobian_is_that_of_the_model(truth):
     axes = np.stack([light.axis for light in truth.lights])
     n, beam = len(positions), np.array([1.5, 0.4, -0.3, 0.2])
     flashlights = Flashlights(positions, positions + 500 * axes, np.linspace(-0.1, 0.1, n), beam, 0.02, np.zeros(3))
-    step = np.random.default_rng(3).normal(size=PER_FLASHLIGHT * n + len(beam) + 4) * 1e-4
+    step = np.random.default_rng(3).normal(size=PER_FLASHLIGHT * n + len(beam) + 4 + WALL_TERMS) * 1e-4
+    step[PER_FLASHLIGHT * n + len(beam) + 1 :] = 0  # no wall
     there, back = (log_irradiance(flashlights.moved(s, 0.0), evidence) for s in (step, -step))
     flashlight, shared = jacobian(flashlights, evidence)
     linear = (

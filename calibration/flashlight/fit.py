@@ -9,7 +9,17 @@ from jaxtyping import Bool, Float, Int
 from calibration.flashlight.beam_profile import EXTRA_TERMS
 from calibration.flashlight.descent import RobustWeights, refine
 from calibration.flashlight.duplicates import refuse_still_light
-from calibration.flashlight.model import Evidence, Flashlights, Priors, Tangent, cell_residuals, log_irradiance
+from calibration.flashlight.model import (
+    Evidence,
+    Flashlights,
+    Priors,
+    Samples,
+    Tangent,
+    cell_residuals,
+    cost,
+    free_tangent,
+    log_irradiance,
+)
 from calibration.ground.table_edges import TableEdge, on_table
 from calibration.lights import hand
 from calibration.lights.ground_cells import GroundCells, sample_ground
@@ -27,18 +37,50 @@ OBJECT_LIGHT = 0.2  # times (R / d)^2: what an object of radius R sends, of its 
 FAR = tuple([RobustWeights(2.5, False)] * 15)  # far from the answer no sample is forgotten ...
 NEAR = tuple(RobustWeights(cut, True) for cut in np.geomspace(7.0, 3.0, 8))  # ... then the cut narrows
 LAST = tuple([RobustWeights(3.0, True)] * 8)
-LOOSE_POWER = Priors(log_power=0.1)  # nothing is believed yet about how steady the flashlight is
+LOOSE_POWER = Priors(log_power=0.1)  # nothing is measured yet of how steady the flashlight is, ...
+ALIKE_POWER = Priors(log_power=0.02)  # ... but it is one: what a battery loses in a session, where starts are compared
 STEADY_POWER = 0.003  # narrowest belief in a constant flashlight
 POWER_ERROR = 0.012  # spread of fitted powers that a perfectly steady flashlight shows under LOOSE_POWER
 POWER_SHARE = 0.5  # of the spread beyond that: a belief this wide still steadies the positions
 POWER_VOTE = 0.1  # in the search, a flashlight 10 % brighter than the others counts like 1 % of misfit
 START_BEAM = 2.0  # cos^2: between a bare LED and a focused one
-REFIT_RESIDUAL = 2.0  # of the median photo: such a photo may sit in a wrong minimum, ...
-REFIT_SHARE = 0.5  # ... or one of less ground that follows than this share of the median photo's
+START_BEAMS = (2.0, 6.0)  # a bare LED to a focused one
+START_AMBIENT = 0.02  # of a flashlight at a hand's usual distance: a dark room
+FEW_CELLS = 400  # of a first fit: light is smooth over the ground
+ROUNDS = 5  # of finding directions and the ground's albedo in turn: it settles in three
+MOST_ALBEDO = 0.9  # of white paint
+BLOCKS = 4  # along each side of the ground: regions over which errors are told to be alike
 GLOSS_ANGLE = np.radians(22.0)  # half angle below which a glossy table mirrors the light
 GLOSS_RISE = 0.03
+DIRECTIONS = np.concatenate(  # of a hemisphere, 15 degrees apart: unit vectors
+    [
+        np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.full_like(a, np.sin(e))], -1)
+        for e in np.radians([10.0, 20.0, 30.0, 42.0, 55.0, 70.0])
+        for a in [np.arange(24) * np.pi / 12]
+    ]
+)
 OVAL_GAIN = 0.85  # of the residual: round beams keep 0.98, beams with 2 % of asymmetry at 40 degrees go to 0.5
 OVAL_PHOTOS = 8  # fewer leave the ground's albedo free enough to take the terms up
+
+
+@dataclass(frozen=True)
+class FirstFits:
+    """Fits of a few cells from several starts, their costs, and how many of the samples err independently."""
+
+    states: tuple[Flashlights, ...]
+    costs: Float[np.ndarray, " fits"]
+    independent: float
+
+    def best(self) -> Flashlights:
+        """Return the state of least cost."""
+        return self.states[int(self.costs.argmin())]
+
+    def variance_about(self, chosen: Float[np.ndarray, "photos 3"]) -> Float[np.ndarray, "photos 3"]:
+        """Return the variance of the places over these fits, each as likely as its cost leaves it; world."""
+        log_likelihood = -0.5 * self.independent * np.log(self.costs / self.costs.min())
+        weight = np.exp(log_likelihood)
+        places = np.stack([state.positions for state in self.states])
+        return np.einsum("f,fkx->kx", weight / weight.sum(), (places - chosen) ** 2)
 
 
 @dataclass(frozen=True)
@@ -85,23 +127,6 @@ def before_ends(evidence: Evidence, edges: Sequence[TableEdge]) -> Evidence:
     return replace(evidence, weight=evidence.weight * inside) if inside.sum() >= MIN_GROUND else evidence
 
 
-def hemisphere(cells: GroundCells) -> list[Float[np.ndarray, "candidates 3"]]:
-    """Candidate places of a handheld flashlight, world (mm), one array per elevation."""
-    azimuth = np.arange(0, 2 * np.pi, np.pi / 8)
-    rings = []
-    for elevation in np.radians([12.0, 25.0, 40.0, 55.0, 72.0]):
-        direction = np.stack(
-            [
-                np.cos(elevation) * np.cos(azimuth),
-                np.cos(elevation) * np.sin(azimuth),
-                np.full_like(azimuth, np.sin(elevation)),
-            ],
-            -1,
-        )
-        rings.append(np.concatenate([cells.centre + d * direction for d in hand.DISTANCES]))
-    return rings
-
-
 def misfits(residual: Float[np.ndarray, "trials cells"], common: float | None):
     """Return the median absolute residual of each trial (log units), an unusual power added, and its log power.
 
@@ -115,65 +140,106 @@ def misfits(residual: Float[np.ndarray, "trials cells"], common: float | None):
     return size, offset
 
 
-@dataclass(frozen=True)
-class _Search:
-    """Candidate places of flashlights, and the log irradiance from each at every cell of the evidence."""
-
-    places: Float[np.ndarray, "places 3"]
-    table: Float[np.ndarray, "places cells"]
-
-    @staticmethod
-    def over(places: Float[np.ndarray, "places 3"], like: Flashlights, evidence: Evidence) -> "_Search":
-        """Return flashlights of power 1 at the places, all aimed like the given ones on average."""
-        n = len(places)
-        flashlights = replace(like, positions=places, targets=np.repeat(like.aim[None], n, 0), log_power=np.zeros(n))
-        return _Search(places, log_irradiance(flashlights, evidence))
-
-    def best(self, brightness: Float[np.ndarray, "photos cells"], common: float | None = None):
-        """Return for every photo the place of least median absolute residual, and the log power there.
-
-        Args:
-            brightness: log, albedo taken out, NaN where unknown.
-            common: log power that flashlights are expected to share; None if unknown.
-        """
-        index, power = [], []
-        for row in brightness:
-            known = np.isfinite(row)
-            size, offset = misfits(row[known] - self.table[:, known], common)
-            index.append(int(np.argmin(size)))
-            power.append(offset[index[-1]])
-        return np.array(index), np.array(power)
+def _thinned(evidence: Evidence) -> Evidence:
+    """Return at most FEW_CELLS of the cells that are known in most photos: enough for a search."""
+    known = np.flatnonzero((evidence.weight > 0).mean(0) > 0.5)
+    if len(known) < MIN_GROUND:
+        raise too_little_ground(len(known))
+    return evidence.at(known[:: max(len(known) // FEW_CELLS, 1)])
 
 
-def _thinned(evidence: Evidence, step: int = 4):
-    """Return every step-th cell that is known in most photos, enough for a search; brightness is NaN where unknown."""
-    keep = np.flatnonzero((evidence.weight > 0).mean(0) > 0.5)[::step]
-    if len(keep) * step < MIN_GROUND:
-        raise too_little_ground(len(keep) * step)
-    thin = evidence.at(keep)
-    return thin, np.where(thin.weight > 0, thin.log_grey, np.nan)
+def first_fits(evidence: Evidence) -> FirstFits:
+    """Fit a few cells from several starts: all lights at one distance, under one beam; relative powers are alike.
 
-
-def first_guess(evidence: Evidence) -> Flashlights:
-    """Estimate places and powers by a coarse search: each photo tries a hemisphere, then albedo is estimated again.
-
-    World frame; powers relative to their median. Medians over cells and photos make it robust to object and shadows.
+    On a small patch of ground, distance, aim and beam stand in for one another: from any one start the fit may end in a
+    wrong minimum. Powers are held alike from the first step on, because one flashlight is.
 
     Raises:
         CalibrationError: too little ground is usable in most photos.
     """
-    n, centre = len(evidence.log_grey), evidence.cells.centre
-    thin, log_grey = _thinned(evidence)
-    beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS)]
-    targets = np.repeat(centre[None], n, 0)
-    flashlights = Flashlights(targets, targets, np.zeros(n), beam, 0.02, centre)
-    search = _Search.over(np.concatenate(hemisphere(evidence.cells)), flashlights, thin)
-    level = np.nanmedian(log_grey, axis=0)
-    index, power = search.best(log_grey - level)
-    for _ in range(2):
-        level = np.nanmedian(log_grey - search.table[index] - power[:, None], axis=0)
-        index, power = search.best(log_grey - level, float(np.median(power)))
-    return replace(flashlights, positions=search.places[index], log_power=power - np.median(power))
+    thin = _thinned(evidence)
+    starts = []
+    for beam in START_BEAMS:
+        for distance in hand.DISTANCES[1:-1]:
+            state, weight = refine(_on_sphere(thin, distance, beam), thin, ALIKE_POWER, free_tangent, FAR[:8])
+            starts.append((cost(state, thin, weight, ALIKE_POWER), len(starts), with_wall(state, thin, weight)))
+    better = sorted(starts)[: len(starts) // 2]  # what is far behind by now does not catch up
+    found = [refine(state, thin, ALIKE_POWER, free_tangent, FAR[8:] + NEAR) for _, _, state in better]
+    costs = np.array([cost(state, thin, weight, ALIKE_POWER) for state, weight in found])
+    best, weight = found[int(costs.argmin())]
+    independent = weight.sum() / evidence.weight.max() / design_effect(cell_residuals(best, thin, weight), weight, thin)
+    return FirstFits(tuple(state for state, _ in found), costs, max(independent, 1.0))
+
+
+def first_guess(evidence: Evidence) -> Flashlights:
+    """Return the best of first_fits: world frame, powers relative to one another.
+
+    Raises:
+        CalibrationError: too little ground is usable in most photos.
+    """
+    return first_fits(evidence).best()
+
+
+def _on_sphere(evidence: Evidence, distance: float, beam: float) -> Flashlights:
+    """Return lights of one power at one distance from the photo's middle, each where its photo's ground is lit most so.
+
+    Each photo tries the directions of a hemisphere; then albedo is estimated again. Medians over cells and photos make
+    it robust to object and shadows.
+    """
+    evidence = evidence.at(np.arange(0, evidence.log_grey.shape[1], 3))  # a median needs fewer than a fit
+    centre = evidence.cells.centre
+    places = centre + distance * DIRECTIONS
+    terms = np.r_[beam, np.zeros(EXTRA_TERMS)]
+
+    def state(positions: Float[np.ndarray, "lights 3"]) -> Flashlights:
+        targets = np.repeat(centre[None], len(positions), 0)
+        return Flashlights(positions, targets, np.zeros(len(positions)), terms, START_AMBIENT, centre)
+
+    table = log_irradiance(state(places), evidence)
+    log_grey = np.where(evidence.weight > 0, evidence.log_grey, np.nan)
+    shown, index = np.zeros_like(log_grey), np.zeros(len(log_grey), int)
+    for _ in range(ROUNDS):
+        brightness = log_grey - np.nanmedian(log_grey - shown, axis=0)
+        best = [misfits(row[known] - table[:, known], None) for row in brightness for known in [np.isfinite(row)]]
+        index = np.array([int(size.argmin()) for size, _ in best])
+        power = np.array([offset[k] for (_, offset), k in zip(best, index, strict=True)])
+        shown = table[index] + power[:, None]
+    return state(places[index])
+
+
+def with_wall(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> Flashlights:
+    """Return the state with the wall, of several places, that explains most of its residuals; as it is where none does.
+
+    The residuals' least-squares answer to each wall's light gives its albedo.
+    """
+    residual, total = cell_residuals(flashlights, evidence, weight), np.exp(log_irradiance(flashlights, evidence))
+    best, gain = flashlights, 0.0
+    for azimuth in np.arange(8) * np.pi / 4:
+        for distance in hand.DISTANCES[:5:2]:
+            wall = np.array([azimuth, np.log(distance), 1.0])
+            share = log_irradiance(replace(flashlights, wall=wall), evidence)
+            sent = 1 - total / np.exp(share)
+            sent -= (weight * sent).sum(0) / np.maximum(weight.sum(0), 1e-12)
+            pull, size = float((weight * residual * sent).sum()), float((weight * sent**2).sum())
+            if pull > 0 and pull**2 / max(size, 1e-12) > gain:
+                gain = pull**2 / max(size, 1e-12)
+                best = replace(flashlights, wall=np.array([azimuth, np.log(distance), min(pull / size, MOST_ALBEDO)]))
+    return best
+
+
+def design_effect(residual: Samples, weight: Samples, evidence: Evidence) -> float:
+    """Return how many cells of a photo err as one: the variance of means of neighbours over that of strangers.
+
+    Kish, Survey Sampling (1965), section 5.4.
+    """
+    offset = evidence.cells.points[:, :2] - evidence.cells.centre[:2]
+    block = np.floor(BLOCKS * (offset - offset.min(0)) / (np.ptp(offset, axis=0) + 1e-9)).astype(int) @ [1, BLOCKS]
+    ratio = []
+    for row, some in zip(residual, weight > 0, strict=True):
+        count = np.bincount(block[some], minlength=BLOCKS**2)
+        mean = np.bincount(block[some], row[some] - row[some].mean(), BLOCKS**2) / np.maximum(count, 1)
+        ratio.append((count * mean**2)[count > 1].mean() / max(row[some].var(), 1e-12) if (count > 1).any() else 1.0)
+    return max(float(np.median(ratio)), 1.0)
 
 
 def fit_flashlights(start: Flashlights, evidence: Evidence, tangent: Tangent) -> FlashlightFit:
@@ -300,40 +366,3 @@ def does_not_follow(fit: FlashlightFit) -> Bool[np.ndarray, " photos"]:
 def least_share(share: Float[np.ndarray, " photos"]) -> float:
     """Return the share of the ground that must follow the model: of a beam with rings half does in a usual photo."""
     return DROP_SHARE * float(np.median(share))
-
-
-def may_be_misplaced(fit: FlashlightFit) -> Bool[np.ndarray, " photos"]:
-    """Return which photos misfit twice as much as usual, or show half as much ground that follows."""
-    residual, share = photo_quality(fit)
-    return (residual > REFIT_RESIDUAL) | (share < REFIT_SHARE * float(np.median(share)))
-
-
-def refit_outliers(fit: FlashlightFit) -> FlashlightFit:
-    """Refit after photos with large residuals have tried other starts, one per ring of the hemisphere."""
-    stray = may_be_misplaced(fit)
-    if not stray.any() or stray.sum() > 0.5 * len(stray):
-        return fit
-    thin, log_grey = _thinned(fit.evidence)
-    level = np.nanmedian(np.where(stray[:, None], np.nan, log_grey - log_irradiance(fit.flashlights, thin)), axis=0)
-    best = fit
-    for places in hemisphere(fit.evidence.cells):
-        search = _Search.over(places, fit.flashlights, thin)
-        index, power = search.best(log_grey - np.nan_to_num(level))
-        flashlights = replace(
-            best.flashlights,
-            positions=np.where(stray[:, None], places[index], best.flashlights.positions),
-            targets=np.where(stray[:, None], best.flashlights.aim, best.flashlights.targets),
-            log_power=np.where(stray, power, best.flashlights.log_power),
-        )
-        flashlights, weight = refine(flashlights, fit.evidence, fit.priors, fit.tangent, NEAR)
-        trial = replace(fit, flashlights=flashlights, weight=weight)
-        if _total_residual(trial, stray) < 0.98 * _total_residual(best, stray):
-            best = trial
-    return best
-
-
-def _total_residual(fit: FlashlightFit, photos: Bool[np.ndarray, " photos"]) -> float:
-    """Return the sum over some photos of the median absolute residual of all their ground samples."""
-    residual = np.abs(fit.residual())
-    known = (fit.evidence.weight > 0) & (fit.weight.sum(0) > 0)
-    return float(sum(np.median(residual[k, known[k]]) for k in np.flatnonzero(photos)))

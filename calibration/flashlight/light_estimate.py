@@ -16,12 +16,11 @@ from calibration.flashlight.fit import (
     FlashlightFit,
     before_ends,
     collect,
-    first_guess,
+    first_fits,
     fit_flashlights,
     half_angles,
     least_share,
     photo_quality,
-    refit_outliers,
     with_oval_beams,
     without_gloss,
 )
@@ -29,6 +28,7 @@ from calibration.flashlight.model import Flashlights, Priors, cosines, free_tang
 from calibration.flashlight.outline_lights import OUTLINE_SIDE, outline_sigma, with_outlines
 from calibration.flashlight.tone_curve import WORST_STEPS, compare_curves
 from calibration.flashlight.uncertainty import beam_error, position_sigma, unseen_error
+from calibration.flashlight.wall import WALL_TERMS
 from calibration.light import Light, Vector
 from calibration.lights import hand
 from calibration.lights.ground_cells import ground_ends
@@ -141,7 +141,7 @@ def _powers_only(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
     """Return the tangent that varies only powers and ambient light."""
     n, own, terms = len(flashlights.positions), flashlights.per_flashlight(), len(flashlights.beam)
     columns = [*(own * k + 6 for k in range(n)), own * n + terms]
-    return np.eye(own * n + terms + 4)[:, columns]
+    return np.eye(own * n + terms + 4 + WALL_TERMS)[:, columns]
 
 
 def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: list[str]) -> list[str]:
@@ -256,8 +256,8 @@ def locate_lights(
 ) -> LightFit:
     """Estimate one point light per usable photo (world), with the beam and the ambient light they share.
 
-    Only camera and ground are known. Steps: mean colour of ground cells, a search over a hemisphere of flashlight
-    places, then a robust fit of all flashlights together. The object and its shadows are rejected as outliers, and what
+    Only camera and ground are known. Steps: mean colour of ground cells, fits of a few of them from several
+    starts, then a robust fit of all flashlights together. The object and its shadows are rejected as outliers, and what
     lies beyond the ground's end is left out. Where that places too few lights, outlines of shadows and shading are
     fitted together.
 
@@ -275,12 +275,14 @@ def locate_lights(
     edges = ground_ends(stack, posed_camera, usable)
     evidence = before_ends(evidence, edges)
     LOG.info("fitting the lights to the ground's shading")
-    fit = without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent))
-    fit = with_oval_beams(refit_outliers(fit), evidence)
+    first = first_fits(evidence)
+    fit = with_oval_beams(without_gloss(fit_flashlights(first.best(), evidence, free_tangent)), evidence)
+    fit = replace(fit, between=first.variance_about(fit.flashlights.positions))
     names = [stack.paths[k].name for k in photos]
     tone = compare_curves(fit, np.array(stack.gains)[photos], stack.is_linear)
     floor = np.hypot(unseen_error(fit), WORST_STEPS * tone.error())
-    found = describe(fit, names, floor, *position_sigma(fit))
+    sigma, judged = (np.sqrt(one**2 + fit.between) for one in position_sigma(fit))
+    found = describe(fit, names, floor, sigma, judged)
     found = replace(found, residuals=found.residuals | {"tone": tone.document(), "cue": BY_SHADING})
     if surely_placed(found, evidence.cells.centre) >= FEWEST_USED:
         return found

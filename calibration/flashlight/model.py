@@ -2,10 +2,11 @@
 
 Photo k, cell j at p on the ground, flashlight at s with beam axis a, height z, distance d, c = cosine off the axis:
 
-    pixel_kj = albedo_j * (power_k * g(c) * z * USUAL^2 / d^3 + ambient), USUAL of calibration.lights.hand
+    pixel_kj = albedo_j * (power_k * (g(c) * z / d^3 + wall_kj) * USUAL^2 + ambient), USUAL of calibration.lights.hand
     log g(c) = m log c + r2 u^2 + r3 u^3 + ..., u = 1 - c
 
-Splines of u may be added to log g: see calibration.flashlight.beam_profile.
+wall_kj is what comes by way of a wall: see calibration.flashlight.wall. Splines of u may be added to log g: see
+calibration.flashlight.beam_profile.
 
 A beam that is not round adds (o_1 cos 2 phi + o_2 sin 2 phi) (theta / 40 degrees)^2 to log g, with theta = arccos c
 and phi the angle about the axis. This is the first term of any beam that is symmetric under half a turn; its roll
@@ -24,6 +25,7 @@ from scipy.sparse import csr_array
 
 from calibration.flashlight.beam_profile import SMOOTH_TERMS, derivatives
 from calibration.flashlight.beam_profile import log_gain as beam_log_gain
+from calibration.flashlight.wall import BY, NO_WALL, WALL_TERMS, Wall, moved, wall_light
 from calibration.lights import hand
 from calibration.lights.ground_cells import GroundCells
 from calibration.outlines.terms import OutlineTerms
@@ -50,6 +52,7 @@ class Flashlights:
     beam: Float[np.ndarray, " terms"]  # m, r2, r3, r4, then splines of u, if any
     ambient: float
     aim: Float[np.ndarray, "3"]  # where the person aims on average
+    wall: Wall = field(default_factory=lambda: NO_WALL)
     oval: Float[np.ndarray, "photos 2"] | None = None  # log gain at OVAL_ANGLE by cos 2 phi, sin 2 phi; None: round
     _modelled: list[tuple[GroundCells, float, tuple]] = field(default_factory=list, init=False, repr=False)
 
@@ -78,7 +81,8 @@ class Flashlights:
             self.log_power + np.clip(flashlight[:, 6], -1, 1),
             self.beam + np.clip(rest[:terms], -1, 1),
             max(self.ambient + rest[terms], 0.0),
-            self.aim + rest[terms + 1 :],
+            self.aim + rest[terms + 1 + WALL_TERMS :],
+            moved(self.wall, rest[terms + 1 : terms + 1 + WALL_TERMS]),
             None if self.oval is None else self.oval + flashlight[:, PER_FLASHLIGHT:],
         )
 
@@ -92,6 +96,7 @@ class Priors:
     aim_mean: float = hand.AIM_MEAN  # mm by which the common aim misses the middle of the photo
     beam: float = 5.0  # m, r2, r3, r4
     ring: float = 20.0  # splines
+    wall: tuple[float, ...] = (10.0, 1.0, 1.0)  # azimuth: none is likelier; log distance; albedo
     ambient: float = 0.2  # of a flashlight at a hand's usual distance
     power_outlier: float = 0.1  # a photo this far (log) from the common power is another exposure: Geman-McClure
     usual: Float[np.ndarray, " photos"] | float = 0.0  # log power that a photo shares with those of its group
@@ -160,8 +165,18 @@ def _compute(flashlights: Flashlights, evidence: Evidence):
     z = flashlights.positions[:, 2] - evidence.height
     log_flash = flashlights.log_power[:, None] + log_gain + np.log(z * hand.USUAL**2)[:, None] - 3 * np.log(distance)
     flash = np.exp(log_flash)
-    total = flash + flashlights.ambient
-    return np.log(total), distance, toward, cosine, flash / total, total
+    seen = float(cosine.min())
+    more = _by_wall(flashlights, evidence, flashlights.wall, seen)
+    total = flash + flashlights.ambient + more
+    return np.log(total), distance, toward, cosine, flash / total, total, more, seen
+
+
+def _by_wall(flashlights: Flashlights, evidence: Evidence, wall: Wall, narrowest: float) -> Samples:
+    """Return the irradiance by way of a wall, relative to a flashlight of power 1 at a hand's usual distance."""
+    points, middle = evidence.cells.points, evidence.cells.centre
+    place = flashlights.positions, flashlights.axes(), flashlights.beam
+    power = np.exp(flashlights.log_power[:, None]) * hand.USUAL**2
+    return power * wall_light(wall, *place, narrowest, points, middle)
 
 
 def _oval_terms(
@@ -175,11 +190,12 @@ def _oval_terms(
 
 
 def jacobian(flashlights: Flashlights, evidence: Evidence):
-    """Derivatives of the log irradiance: (photos, cells, own) by each photo's, (photos, cells, terms + 1) by the rest.
+    """Derivatives of the log irradiance: (photos, cells, own) by each photo's, (photos, cells, terms + 4) by the rest.
 
-    The turn of the oval's terms with flashlight and axis is neglected: these terms are a few per cent of the gain.
+    Two turns are neglected: that of the oval's terms with flashlight and axis, and that of the wall's light with the
+    flashlight's place, aim and beam. Both are a few per cent of the light.
     """
-    _, distance, toward, cosine, share, total = _model(flashlights, evidence)
+    _, distance, toward, cosine, share, total, more, seen = _model(flashlights, evidence)
     axes = flashlights.axes()
     by_cosine, by_term = derivatives(cosine, flashlights.beam)
     reach = np.linalg.norm(flashlights.targets - flashlights.positions, axis=1)[:, None, None]
@@ -194,7 +210,12 @@ def jacobian(flashlights: Flashlights, evidence: Evidence):
     if flashlights.oval is not None:
         flashlight[..., PER_FLASHLIGHT:] = _oval_terms(toward, cosine, axes)
     flashlight *= share[..., None]
-    return flashlight, np.concatenate([by_term * share[..., None], (1 / total)[..., None]], -1)
+    flashlight[..., 6] += more / total
+    wall = flashlights.wall
+    by_wall = [(_by_wall(flashlights, evidence, wall + step, seen) - more) / BY for step in BY * np.eye(WALL_TERMS)[:2]]
+    by_wall.append(_by_wall(flashlights, evidence, np.r_[wall[:2], 1.0], seen) if wall[2] <= 0 else more / wall[2])
+    shared = [by_term * share[..., None], np.stack([np.ones_like(total), *by_wall], -1) / total[..., None]]
+    return flashlight, np.concatenate(shared, -1)
 
 
 def cell_residuals(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> Samples:
@@ -222,8 +243,8 @@ def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
     """Return the residuals of the priors, divided by their sigmas, and their derivatives (rows x full)."""
     n, terms = len(flashlights.positions), len(flashlights.beam)
     own = flashlights.per_flashlight()
-    full = own * n + terms + 4
-    jac = np.zeros((3 * n + terms + 4 + (own - PER_FLASHLIGHT) * n, full))
+    full = own * n + terms + 4 + WALL_TERMS
+    jac = np.zeros((3 * n + terms + 4 + WALL_TERMS + (own - PER_FLASHLIGHT) * n, full))
     first, second = across(flashlights.axes())
     miss = flashlights.targets - flashlights.aim
     width = priors.aim
@@ -240,17 +261,19 @@ def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
         np.full(min(terms, SMOOTH_TERMS), priors.beam),
         np.full(max(terms - SMOOTH_TERMS, 0), priors.ring),
         priors.ambient,
+        priors.wall,
         np.full(3, priors.aim_mean),
     ]
     jac[3 * n : 3 * n + len(rest), rest] = np.diag(1 / widths)
     oval = np.zeros(0) if flashlights.oval is None else flashlights.oval.T.ravel() / priors.oval
     for term in range(own - PER_FLASHLIGHT):
         jac[3 * n + len(rest) + n * term + rows, own * rows + PER_FLASHLIGHT + term] = 1 / priors.oval
+    missed = flashlights.aim - evidence.cells.centre
     value = np.r_[
         (miss * first).sum(1) / width,
         (miss * second).sum(1) / width,
         own_power / bent**0.5 / priors.log_power,
-        np.r_[flashlights.beam, flashlights.ambient, flashlights.aim - evidence.cells.centre] / widths,
+        np.r_[flashlights.beam, flashlights.ambient, flashlights.wall - NO_WALL, missed] / widths,
         oval,
     ]
     return value, jac
@@ -267,10 +290,10 @@ def across(axes: Float[np.ndarray, "photos 3"]):
 def free_tangent(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
     """Return a basis per free photo: position 3, aim 2 (across the beam), power 1, [oval 2]; and the shared parameters.
 
-    The shared parameters are beam, ambient and mean aim.
+    The shared parameters are beam, ambient, wall and mean aim.
     """
     n, own = len(flashlights.positions), flashlights.per_flashlight()
-    rest = len(flashlights.beam) + 4
+    rest = len(flashlights.beam) + 4 + WALL_TERMS
     free = own - 1
     out = np.zeros((own * n + rest, free * n + rest))
     first, second = across(flashlights.axes())
@@ -300,7 +323,7 @@ def normal_equations(
     """Return J' W J and J' W r in the full coordinates with priors; albedo is eliminated by its Schur complement.
 
     Triggs et al., Bundle Adjustment - A Modern Synthesis (2000), section 6. Full coordinates: per photo position (world
-    length), a point on the beam axis (world length), log power, [oval 2]; then the beam's terms, ambient, mean aim.
+    length), a point on the beam axis (world length), log power, [oval 2]; then beam, ambient, wall, mean aim.
 
     Args:
         slopes: of `jacobian`, where the caller has them.

@@ -17,10 +17,9 @@ from calibration.flashlight.fit import (
     collect,
     first_guess,
     fit_flashlights,
-    refit_outliers,
     without_gloss,
 )
-from calibration.flashlight.led_offset import FITTED_SIGMA, QUARTER_TURNS, BackView, Choice, choose
+from calibration.flashlight.led_photo import FITTED_SIGMA, QUARTER_TURNS, BackView, Choice, choose
 from calibration.flashlight.light_estimate import LightFit, describe
 from calibration.flashlight.model import Flashlights, free_tangent
 from calibration.flashlight.outline_lights import outlines_of
@@ -95,7 +94,7 @@ def locate_lights_from_phone(
     edges = ground_ends(stack, posed_camera, usable)
     evidence = before_ends(evidence, edges)
     lens, poses = _poses(views)
-    alone = refit_outliers(without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent)))
+    alone = without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent))
     poses = _least_turned(poses, views, alone.flashlights)
     partner = pair_in_order(poses, alone.flashlights, evidence.cells.centre, photos)
     if len(poses) == len(usable) and (partner >= 0).sum() < FEWEST_PAIRED * len(photos):

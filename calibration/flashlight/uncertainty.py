@@ -11,6 +11,7 @@ The stated error of a light is made of lengths that its own photo and the fit sh
 - beam: a beam may have a hot centre and rings, which a smooth one cannot follow: it moves all lights together, and each
   photo's residuals stay small. How far the lights move when the beam gets splines tells. Counted where the shading of
   most photos places no light surely; elsewhere the beam is smooth, as the other errors show;
+- starts: fits from other starts that explain a few cells about as well lie elsewhere (fit.FirstFits);
 - what no residual shows: a small share of the distance.
 
 The error of the camera's pose is added in calibration.calibrate, that of the tone curve by calibration.flashlight.
