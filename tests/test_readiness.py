@@ -167,6 +167,21 @@ def test_a_tripod_that_moved_is_a_reason_and_the_advice_is_to_photograph_the_boa
     assert told.grade == "poor" and told.reasons[0].endswith("so camera and ground are somewhat off")
 
 
+@pytest.mark.parametrize(("share", "grade"), [(0.01, "good"), (0.05, "fair"), (0.07, "poor"), (0.4, "poor")])
+@pytest.mark.parametrize("used", [26, 11])
+def test_lights_of_large_uncertainty_decide_the_grade_and_are_named_first(truth, cover, share, grade, used):
+    lights = [
+        replace(x, used=k < used, sigma=np.full(3, share * np.linalg.norm(x.position - cover.centre) / np.sqrt(3)))
+        for k, x in enumerate(truth.calibration.lights)
+    ]
+    found = judge(replace(truth.calibration, lights=tuple(lights)), [], cover)
+    if used == len(lights):
+        assert found.grade == grade, found.reasons
+    named = f"the lights' places are uncertain by {share:.1%} of their distance (at most 6% is fine)"
+    assert (named in found.reasons) == (grade != "good")
+    assert (found.reasons[:1] == (named,)) == (grade == found.grade != "good")
+
+
 def test_doubts_and_dropped_photos_are_reasons(truth, cover):
     names = [light.photo for light in truth.calibration.lights]
     findings = [Finding(Path(name), "blurred", "shaken", 0.4, 0.8, True) for name in names[:9]]

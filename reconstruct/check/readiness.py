@@ -24,7 +24,7 @@ PLENTY = 25  # photos from which more add little
 WIDE_GAP, HALF = np.radians(90.0), np.radians(180.0)  # of the horizon without light: shape is mostly guessed
 LOW, HIGH = np.radians(20.0), np.radians(60.0)  # shadows longer than 2.7 heights leave the picture, short ones hide
 FEW_BANDS = 0.15  # of the photos that should be lower than HIGH, and higher than the middle of both
-LARGE_SIGMA = 0.03  # of a light's distance: more is refined with the surface, but costs shape
+LARGEST_SIGMA = 0.06  # of a light's distance: with more, a shape is seldom right to 3 % of its size
 MANY_DROPPED, MANY_CUT = 0.25, 0.4  # of the photos
 LITTLE_GROUND, LITTLE_RING = 0.15, 0.5  # of the picture, of the ground near the object
 SMALLEST_OBJECT, LARGEST_OBJECT = 0.002, 0.6  # of the picture
@@ -89,10 +89,10 @@ def judge(
     """
     say = Judge([])
     facts = capture_facts(calibration, findings, cover)
+    _judge_lights(say, facts)  # first of its grade: shadows, normals and outlines rest on the lights
     judge_photos(say, facts, findings, is_part)
     if not is_part:
         judge_gap(say, facts["photos_used"], widest_gap(calibration, cover.centre), calibration, cover.centre)
-    _judge_lights(say, facts)
     _judge_shadows(say, facts)
     for doubt in doubts:
         say("fair", doubt, "")
@@ -226,10 +226,11 @@ def _judge_lights(say: Judge, facts: dict[str, Any]) -> None:
         say("fair", "nearly all lights are high above the object", "Hold the flashlight lower, for longer shadows.")
     if facts["share_above_40_deg"] < FEW_BANDS:
         say("fair", "nearly all lights are low", "Shoot some photos with the flashlight high above the object.")
-    if facts["light_sigma_share"] > LARGE_SIGMA:
+    sigma = facts["light_sigma_share"]
+    if 2 * sigma > LARGEST_SIGMA:  # an error of two sigma is too large, or one of a single sigma
         say(
-            "fair",
-            f"the lights' places are uncertain by {facts['light_sigma_share']:.1%} of their distance",
+            "poor" if sigma > LARGEST_SIGMA else "fair",
+            f"the lights' places are uncertain by {sigma:.1%} of their distance (at most {LARGEST_SIGMA:.0%} is fine)",
             "Show more bare, matt table, or photograph the board with the flashlight's phone for each photo.",
         )
 
