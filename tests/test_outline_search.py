@@ -48,8 +48,8 @@ def test_lights_are_found_from_rough_starts_of_which_one_is_far_off(ball):
     rough = 0.75 * lights * np.exp(0.1 * rng.standard_normal(lights.shape))
     rough[5] *= 0.6
     fit = joint_search.searched([np.roll(rough, 3, axis=0), rough], _shaded(maps, lights))
-    assert np.median(_off(fit.flashlights.positions, lights)) < 0.04 < 0.2 < np.median(_off(rough, lights))
-    assert _off(fit.flashlights.positions, lights).max() < 0.06
+    assert np.median(_off(fit.flashlights.positions, lights)) < 0.05 < 0.2 < np.median(_off(rough, lights))
+    assert _off(fit.flashlights.positions, lights).max() < 0.08
 
 
 def _with_one_lost(maps, lights: np.ndarray, k: int) -> tuple[FlashlightFit, Evidence]:

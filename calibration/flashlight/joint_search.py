@@ -25,6 +25,7 @@ from calibration.flashlight.model import (
     free_tangent,
     log_irradiance,
 )
+from calibration.flashlight.wall import NO_WALL, WALL_TERMS, Wall
 from capture.checks.robust import spread
 
 LOG = logging.getLogger(__name__)
@@ -46,7 +47,9 @@ _Found = tuple[float, FlashlightFit, float]  # cost of its outlines, fit, misfit
 LOOSE = Priors(log_power=0.1, beam=50.0, power_outlier=0.5)  # a hot centre, rings; a phone's tone differs by photo
 
 
-def searched(starts: Sequence[Float[np.ndarray, "photos 3"]], evidence: Evidence) -> FlashlightFit:
+def searched(
+    starts: Sequence[Float[np.ndarray, "photos 3"]], evidence: Evidence, wall: Wall = NO_WALL
+) -> FlashlightFit:
     """Fit to outlines and shading together from rough starts; return the best fit.
 
     Outlines alone pull all lights too near, and one light that is too near, its beam aimed elsewhere, may agree with
@@ -58,13 +61,14 @@ def searched(starts: Sequence[Float[np.ndarray, "photos 3"]], evidence: Evidence
     Args:
         starts: positions, world.
         evidence: with outlines; photos that these do not trust are placed by their shading.
+        wall: that sends light back, as all cells of the ground tell it.
     """
     assert evidence.outlines is not None
     trusted = _trusted(evidence)
     found = []
     for number, one in enumerate(starts):
         LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", number + 1, len(starts) + 1)
-        found.append(_pass(_held(one, _weighted(trusted, USUAL_MISFIT), None)[0], trusted, USUAL_MISFIT))
+        found.append(_pass(_held(one, _weighted(trusted, USUAL_MISFIT), None, wall)[0], trusted, USUAL_MISFIT))
     best = found[int(_posteriors(found, trusted).argmin())]
     LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", len(starts) + 1, len(starts) + 1)
     found.append(_pass(_best_of_each(best, found, evidence), trusted, best[2]))
@@ -121,7 +125,7 @@ def _pass(state: Flashlights, evidence: Evidence, misfit: float) -> _Found:
     weighted = _weighted(evidence, misfit)
     for blur in BLURS:
         blurred = replace(weighted, outlines=replace(evidence.outlines, blur=blur))
-        state = refine(state, blurred, LOOSE, free_tangent, FAR[:PER_BLUR])[0]
+        state = refine(state, blurred, LOOSE, _wall_held, FAR[:PER_BLUR])[0]
     return _settled(state, evidence, misfit)
 
 
@@ -192,11 +196,11 @@ def _settled(start: Flashlights, evidence: Evidence, misfit: float) -> _Found:
     terms = evidence.outlines
     assert terms is not None
     weighted = _weighted(evidence, misfit)
-    flashlights, weight = refine(start, weighted, LOOSE, free_tangent, FAR[:8] + NEAR)
+    flashlights, weight = refine(start, weighted, LOOSE, _wall_held, FAR[:8] + NEAR)
     misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
     return (
         terms.cost(flashlights.positions) if (weight > 0).any() else LOST,
-        FlashlightFit(flashlights, _weighted(evidence, misfit), weight, LOOSE, free_tangent),
+        FlashlightFit(flashlights, _weighted(evidence, misfit), weight, LOOSE, _wall_held),
         misfit,
     )
 
@@ -214,7 +218,7 @@ def _weighted(evidence: Evidence, misfit: float) -> Evidence:
 
 
 def _held(
-    places: Float[np.ndarray, "photos 3"], evidence: Evidence, like: Flashlights | None
+    places: Float[np.ndarray, "photos 3"], evidence: Evidence, like: Flashlights | None, wall: Wall = NO_WALL
 ) -> tuple[Flashlights, Samples]:
     """Fit beam, aims and powers with the places held; return also the samples' weights.
 
@@ -225,15 +229,22 @@ def _held(
     if like is not None:
         return refine(replace(like, positions=places), evidence, LOOSE, _places_held, FAR[:2] + NEAR)
     beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS + RING_TERMS)]
-    state = Flashlights(places, np.repeat(centre[None], n, 0), np.zeros(n), beam, 0.02, centre)
+    state = Flashlights(places, np.repeat(centre[None], n, 0), np.zeros(n), beam, 0.02, centre, wall)
     for _ in range(AIM_ROUNDS):
         state, weight = refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)
         state = looked_for_aims(state, evidence, weight)
     return refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)
 
 
-def _places_held(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
+def _wall_held(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
+    """Return free_tangent without the wall: few cells, trusted little, would take any wall for the lights' distance."""
     basis = free_tangent(flashlights)
+    last = basis.shape[1] - 3  # the mean aim
+    return np.delete(basis, np.arange(last - WALL_TERMS, last), axis=1)
+
+
+def _places_held(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
+    basis = _wall_held(flashlights)
     n, free = len(flashlights.positions), flashlights.per_flashlight() - 1
     columns = np.arange(basis.shape[1])
     return basis[:, (columns >= free * n) | (columns % free >= 3)]

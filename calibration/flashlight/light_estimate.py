@@ -287,7 +287,7 @@ def locate_lights(
     if surely_placed(found, evidence.cells.centre) >= FEWEST_USED:
         return found
     found = _doubted(found, fit)
-    joint = with_outlines(evidence, stack, posed_camera, usable, fit.flashlights.positions, edges, cues)
+    joint = with_outlines(evidence, stack, posed_camera, usable, fit.flashlights, edges, cues)
     if joint is None:
         return found
     sigma = outline_sigma(joint)

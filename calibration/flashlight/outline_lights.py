@@ -21,6 +21,7 @@ from calibration.flashlight.fit import (
 from calibration.flashlight.joint_search import CONTRASTS, at_best_contrast, searched
 from calibration.flashlight.model import (
     Evidence,
+    Flashlights,
     normal_equations,
 )
 from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
@@ -51,7 +52,7 @@ def with_outlines(
     stack: PhotoStack,
     posed_camera: PosedCamera,
     photos: Bool[np.ndarray, " photos"],
-    by_shading: Float[np.ndarray, "photos 3"],
+    by_shading: Flashlights,
     edges: Sequence[TableEdge] = (),
     cues: MetricCues = NO_CUES,
 ) -> FlashlightFit | None:
@@ -60,7 +61,7 @@ def with_outlines(
     Args:
         evidence: of the used photos, before any fit.
         photos: which of the stack these are.
-        by_shading: positions, world, that shading alone gives; some may be far off.
+        by_shading: what shading alone gives, world; some may be far off. Its wall is kept.
         edges: where the ground ends, world: no shadow beyond them is looked at.
         cues: photos from the side, a height: they fix the numbers that outlines leave free.
     """
@@ -69,13 +70,13 @@ def with_outlines(
     terms = _terms(coarse, field, shadows, posed_camera, cues)
     if terms is None:
         return None
-    starts = [*shadow_starts(terms.maps, shadows.object_mask, posed_camera), by_shading]
+    starts = [*shadow_starts(terms.maps, shadows.object_mask, posed_camera), by_shading.positions]
     cells = replace(_lit_cells(evidence, shadows, posed_camera), outlines=terms)
-    fit = searched(starts, cells)
+    fit = searched(starts, cells, by_shading.wall)
     wide = _terms(coarse, field, shadows, posed_camera, cues, True) if _at_odds(fit, terms) > OUTLINES_WRONG else None
     if wide is not None and _at_odds(fit, wide) < REPAIRED * _at_odds(fit, terms):
         terms = wide
-        fit = searched([fit.flashlights.positions], replace(cells, outlines=wide))
+        fit = searched([fit.flashlights.positions], replace(cells, outlines=wide), by_shading.wall)
     if _ground(fit) < MIN_GROUND / THIN:
         return None
     # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share
