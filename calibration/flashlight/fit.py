@@ -79,8 +79,16 @@ class FirstFits:
         """Return the variance of the places over these fits, each as likely as its cost leaves it; world."""
         log_likelihood = -0.5 * self.independent * np.log(self.costs / self.costs.min())
         weight = np.exp(log_likelihood)
-        places = np.stack([state.positions for state in self.states])
-        return np.einsum("f,fkx->kx", weight / weight.sum(), (places - chosen) ** 2)
+        return variance_about(chosen, np.stack([state.positions for state in self.states]), weight)
+
+
+def variance_about(
+    chosen: Float[np.ndarray, "photos 3"],
+    places: Float[np.ndarray, "fits photos 3"],
+    weight: Float[np.ndarray, " fits"],
+) -> Float[np.ndarray, "photos 3"]:
+    """Return the variance of a mixture of fits about the one that is chosen, without the variance of each by itself."""
+    return np.einsum("f,fkx->kx", weight / weight.sum(), (places - chosen) ** 2)
 
 
 @dataclass(frozen=True)

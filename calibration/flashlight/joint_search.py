@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from calibration.flashlight.beam_profile import EXTRA_TERMS, RING_TERMS
 from calibration.flashlight.descent import refine
-from calibration.flashlight.fit import FAR, NEAR, START_BEAM, FlashlightFit, misfits
+from calibration.flashlight.fit import FAR, NEAR, START_AMBIENT, START_BEAM, FlashlightFit, misfits, variance_about
 from calibration.flashlight.model import (
     NOISE,
     Evidence,
@@ -182,15 +182,6 @@ def _posteriors(found: Sequence[_Found], evidence: Evidence) -> Float[np.ndarray
     return np.array([one[0] for one in found]) + cells * np.log(misfit)
 
 
-def variance_about(
-    chosen: Float[np.ndarray, "photos 3"],
-    places: Float[np.ndarray, "fits photos 3"],
-    weight: Float[np.ndarray, " fits"],
-) -> Float[np.ndarray, "photos 3"]:
-    """Return the variance of a mixture of fits about the one that is chosen, without the variance of each by itself."""
-    return np.einsum("f,fkx->kx", weight / weight.sum(), (places - chosen) ** 2)
-
-
 def _settled(start: Flashlights, evidence: Evidence, misfit: float) -> _Found:
     """Refine a state near the answer; misfit: of the shading, log units, by which its cells are weighted."""
     terms = evidence.outlines
@@ -229,7 +220,7 @@ def _held(
     if like is not None:
         return refine(replace(like, positions=places), evidence, LOOSE, _places_held, FAR[:2] + NEAR)
     beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS + RING_TERMS)]
-    state = Flashlights(places, np.repeat(centre[None], n, 0), np.zeros(n), beam, 0.02, centre, wall)
+    state = Flashlights(places, np.repeat(centre[None], n, 0), np.zeros(n), beam, START_AMBIENT, centre, wall)
     for _ in range(AIM_ROUNDS):
         state, weight = refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)
         state = looked_for_aims(state, evidence, weight)
