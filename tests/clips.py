@@ -78,17 +78,6 @@ def _replaced(data: bytes, start: int, end: int, new: bytes) -> bytes:
     return bytes(out[:start]) + new + bytes(out[end:])
 
 
-def slow_down_second_half(path: Path, factor: int) -> Path:
-    """Variable frame rate: every frame of the second half lasts `factor` times as long."""
-    data = path.read_bytes().replace(b"edts", b"free")  # the edit list ends where the clip used to
-    at = data.index(b"stts")
-    count, step = (int.from_bytes(data[at + k : at + k + 4], "big") for k in (12, 16))
-    entries = [(count // 2, step), (count - count // 2, factor * step)]
-    table = len(entries).to_bytes(4, "big") + b"".join(v.to_bytes(4, "big") for entry in entries for v in entry)
-    path.write_bytes(_replaced(data, at + 8, at + 20, table))
-    return path
-
-
 def turn_in_container(path: Path) -> Path:
     """The quarter turn that a phone held upright writes into the track's header."""
     data = bytearray(path.read_bytes())

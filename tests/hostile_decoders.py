@@ -72,13 +72,6 @@ def opens_what_it_can(file: BinaryIO) -> Iterator[Answer]:
     yield Answer((len(_held) - before,))
 
 
-def limit_of_core_files(file: BinaryIO) -> Iterator[Answer]:
-    import resource
-
-    del file
-    yield Answer(resource.getrlimit(resource.RLIMIT_CORE))
-
-
 def takes_memory(file: BinaryIO) -> Iterator[Answer]:
     del file
     while True:

@@ -69,16 +69,6 @@ def test_a_board_that_there_is_not_is_refused_before_any_photo_is_read(tmp_path)
         open_source(capture, RunOptions())
 
 
-def test_three_photos_only(capsys, tmp_path):
-    sentence = refusal(capsys, tmp_path, copy_photos(tmp_path / "capture", photos=3))
-    assert "3 photos" in sentence and "4" in sentence
-
-
-def test_a_board_specification_that_is_not_one(capsys, tmp_path):
-    sentence = refusal(capsys, tmp_path, copy_photos(tmp_path / "capture"), "--board", "chessboard:8x8")
-    assert "chessboard:8x8" in sentence and "checkerboard:9x6:24.25" in sentence
-
-
 def test_shadow_pictures_asked_for_where_there_are_only_photos(capsys, tmp_path):
     assert "--input" in refusal(capsys, tmp_path, copy_photos(tmp_path / "capture"), "--input", "shadow")
 

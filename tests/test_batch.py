@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -86,12 +85,6 @@ def test_a_folder_of_captures_stands_for_all_of_them_and_a_capture_for_itself(tm
         find_captures([tmp_path / "nowhere"], out)
 
 
-def test_a_link_to_a_capture_gives_its_own_name(tmp_path):
-    (tmp_path / "0131" / "photos").mkdir(parents=True)
-    (tmp_path / "vase").symlink_to(tmp_path / "0131")
-    assert names_of([tmp_path / "vase"]) == ["vase"]
-
-
 def test_names_of_results_tell_captures_of_one_name_apart_and_are_safe_as_folders():
     names = names_of([Path("/a/monday/vase"), Path("/a/tuesday/vase"), Path("/a/my head"), Path("/b/..x")])
     assert names == ["monday__vase", "tuesday__vase", "my_head", "x"]
@@ -142,19 +135,6 @@ def test_the_same_batch_again_runs_only_what_failed_or_changed(tmp_path):
     again = tasks_of(tmp_path, paths[1:2], ("--preset", "draft"))
     run_batch(again, partial(locally, jobs=1), lambda _: None)
     assert starts(again[0]) == 2
-
-
-def test_results_inside_a_capture_are_no_change_of_it(tmp_path):
-    (path,) = captures(tmp_path, vase="fine")
-    (task,) = (replace(task, out=str(path / "results")) for task in tasks_of(tmp_path, [path]))
-    for _ in range(2):
-        run_batch([task], partial(locally, jobs=1), lambda _: None)
-        (path / "results" / "index.html").write_text("the page, written after the run")
-        os.utime(path / "results" / "index.html", (time.time() + 5,) * 2)
-    assert starts(task) == 1
-    os.utime(path / "photos" / "what.txt", (time.time() + 5,) * 2)
-    run_batch([task], partial(locally, jobs=1), lambda _: None)
-    assert starts(task) == 2
 
 
 def test_a_photo_that_comes_while_its_capture_runs_is_not_lost(tmp_path):

@@ -55,18 +55,6 @@ def test_a_sheet_says_how_its_rows_were_made_and_keeps_them(bench, monkeypatch, 
     assert "| what | a | b |\n| --- | ---: | --- |\n| x | 0.123 |  |\n| y | 12 | p, q |\n\nMore." in said
 
 
-def test_rows_are_kept_again_with_every_row(bench, tmp_path):
-    file, kept = tmp_path / "it.json", []
-
-    def rows():
-        for n in (1, 2):
-            kept.append(len(json.loads(file.read_text())["rows"]) if file.exists() else 0)
-            yield {"name": f"r{n}", "n": n}
-
-    bench("sheet").Sheet(file, "seed 3").fill(rows())
-    assert kept == [0, 1] and len(json.loads(file.read_text())["rows"]) == 2
-
-
 def test_a_refused_solve_is_a_row_that_says_so(bench):
     solves, ball = bench("solves"), bench("solves").synthetic("shadow")
     none = replace(ball.calibration, lights=tuple(replace(x, used=False) for x in ball.calibration.lights))
@@ -90,13 +78,6 @@ def test_the_page_of_results_is_what_the_rows_make_and_has_at_most_twelve_tables
     assert text == (FOLDER.parent / "docs" / "results.md").read_text(encoding="utf-8"), "run benchmarks/collect.py"
     tables = re.findall(r"(?m)^\| -", text)
     assert len(tables) <= 12 and text.count("Made by `") == len(tables)
-
-
-def test_rows_that_stand_in_no_table_are_named(bench, tmp_path):
-    for name in ("captures", "nobodys"):
-        (tmp_path / f"{name}.json").write_text("{}")
-    with pytest.raises(ValueError, match="nobodys"):
-        bench("collect").page(tmp_path)
 
 
 def test_a_solve_of_the_synthetic_scene_is_scored_against_its_truth(bench):

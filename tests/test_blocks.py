@@ -11,9 +11,8 @@ from reconstruct.config import FitConfig
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import supervise
 from reconstruct.sdf import kernels
-from reconstruct.sdf.blocks import Blocks, near_surface, overlapping, pack
+from reconstruct.sdf.blocks import Blocks, overlapping, pack
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.kernels import SIDE
 from reconstruct.sdf.level_set import BAND, LevelSet, resampled
 from reconstruct.sdf.rays import first_surfaces
 from reconstruct.solve.operators import RayPasses
@@ -48,12 +47,6 @@ def whole(phi: np.ndarray) -> Blocks:
     return pack(phi, np.inf)
 
 
-def test_packing_loses_nothing():
-    rng = np.random.default_rng(0)
-    for phi in (two_balls(), np.clip(two_balls(), -BAND, BAND), rng.normal(size=(5, 9, 17)).astype(np.float32)):
-        np.testing.assert_array_equal(pack(phi).dense(), phi)
-
-
 def test_blocks_far_from_the_surface_are_not_stored_and_say_how_far_they_are():
     phi = np.full((80, 80, 80), BAND, np.float32)
     phi[:, :, :24] = -BAND
@@ -64,16 +57,6 @@ def test_blocks_far_from_the_surface_are_not_stored_and_say_how_far_they_are():
     )  # cells between -far and far are in the layer below
     assert field.layout[2, 2, 0] == -(2 * 2 + 1) and field.layout[2, 2, 9] == -2 * 4 and field.layout[9, 9, 8] == -2 * 6
     np.testing.assert_array_equal(field.dense(), phi)
-
-
-def test_every_node_within_a_block_of_the_surface_is_stored():
-    phi = two_balls()
-    field = near_surface(pack(phi), BAND)
-    stored = np.repeat(np.repeat(np.repeat(field.layout >= 0, SIDE, 0), SIDE, 1), SIDE, 2)[tuple(map(slice, SHAPE))]
-    assert stored[np.abs(phi) <= SIDE - 1].all() and stored.mean() < 0.6
-    found = field.dense()
-    np.testing.assert_array_equal(found[stored], phi[stored])
-    np.testing.assert_array_equal(found[~stored], np.where(phi < 0, -BAND, BAND)[~stored])
 
 
 @pytest.mark.parametrize("sharpness", [4.0, 25.0])
@@ -114,14 +97,3 @@ def test_a_solve_on_blocks_is_the_solve_on_the_whole_grid():
     moved = np.abs(on_all.phi - resampled(replace(start, values=torch.from_numpy(away).float()), 90).phi)
     assert moved.max() > 0.5
     np.testing.assert_allclose(on_blocks.phi, on_all.phi, atol=1e-5)
-
-
-def test_resampling_near_the_surface_is_resampling_everywhere():
-    away = torch.from_numpy(two_balls())
-    coarse = SdfGrid(away, torch.zeros(3), 1.0)
-    fine = resampled(coarse, 151)
-    spacing = 100 / 150
-    axes = [torch.arange(n) * spacing for n in fine.field.nodes]
-    everywhere = coarse.sdf(torch.cartesian_prod(*axes)).reshape(fine.field.nodes)
-    expected = LevelSet(everywhere.numpy() / np.float32(spacing), np.zeros(3), spacing)
-    np.testing.assert_allclose(fine.phi, expected.phi, atol=1e-4)

@@ -1,14 +1,11 @@
 """What every length rests on is said, and a size that lens, focus or markers contradict is doubted."""
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 from board_photos import board_photo, look_at
-from fake_run import make_truth
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
@@ -16,9 +13,8 @@ from calibration.board.board import Board, parse_board
 from calibration.board.board_photos import fit_board
 from calibration.board.board_scale import scale_doubts, scale_of, scale_parts, scale_sentence
 from calibration.camera import Camera
-from capture.decode.exif import Optics, optics_of
+from capture.decode.exif import Optics
 from capture.session.session import Session, SessionSettings
-from viewer.report.pictures import size_facts
 
 CAMERA = Camera(1200, 900, 1000.0, 1000.0, 599.5, 449.5)
 BOARD = Board("charuco", 5, 7, 30.0, 22.0, "DICT_4X4_50")
@@ -107,14 +103,6 @@ def test_what_every_length_rests_on_is_one_sentence(spec, is_named, said):
     assert said in scale_sentence({"scale": scale_of(parse_board(spec), is_named)})
 
 
-@pytest.mark.parametrize("square", [22.0, 30.0, 2.2])
-def test_the_report_says_it_beside_the_size(square):
-    truth = make_truth(width=64, n_lights=4).calibration
-    rests_on = scale_of(Board("checkerboard", 9, 6, square), True)
-    facts = size_facts(trimesh.creation.box((40, 30, 20)), replace(truth, residuals={"scale": rests_on}))
-    assert facts[1] == (f"one square = {square:g} mm", "Every length rests on this, as you typed it. Measure it.")
-
-
 @pytest.mark.parametrize("entry", [None, 3, {"length": 1, "from": "x"}, {"length": "x"}])
 def test_a_strangers_entry_of_the_scale_is_left_out(entry):
     assert scale_parts({"scale": entry}) is None and scale_sentence({"scale": entry}) == ""
@@ -134,12 +122,3 @@ def test_how_near_a_lens_is_sharp_follows_from_its_focal_length(optics, closest)
     assert optics.closest_mm() == pytest.approx(closest, abs=0.1)
     near, far = (scale_doubts(BOARD, away, "IMG_1.jpg", optics, None) for away in (0.9 * closest, 1.1 * closest))
     assert len(near) == 1 and "not sharp nearer" in near[0] and far == []
-
-
-def test_focus_is_read_in_millimetres_and_nonsense_is_none():
-    exif = Image.Exif()
-    exif.get_ifd(0x8769).update({FOCUS: IFDRational(123, 100), 37386: IFDRational(-1, 2), 41989: 26})
-    read = optics_of(exif)
-    assert (read.focal_mm, read.focal_35mm) == (None, 26.0) and read.focus_mm == pytest.approx(1230)
-    assert optics_of(Image.Exif()) == Optics()
-    assert replace(Optics(), focal_mm=5.6).words() == "its lens of 5.6 mm (EXIF)"

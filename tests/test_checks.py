@@ -1,4 +1,3 @@
-import warnings
 from dataclasses import replace
 
 import cv2
@@ -6,9 +5,7 @@ import lit_table
 import numpy as np
 import pytest
 
-from capture.checks.ambient_light import find_shadows
 from capture.checks.check_stack import check_stack
-from capture.checks.robust import column_quantile, column_spread, spread
 
 N = 12
 
@@ -74,16 +71,6 @@ def test_shake_along_one_axis_is_found(stack, axis):
     assert dropped(findings) == [("IMG_5.jpg", "blurred")]
 
 
-def test_where_a_third_is_shaken_the_others_tell_what_is_usual():
-    """The strongly shaken ones must not widen what passes: the last is shaken less, and blurred all the same."""
-    rng = np.random.default_rng(3)
-    photos = lit_table.lit_photos(18, rng, lit_table.with_object(lit_table.table(rng)))
-    shaken = {1: 2.5, 4: 2.0, 7: 1.5, 10: 2.2, 13: 3.0, 16: 1.0}  # px; the others differ a little, too
-    soft = [cv2.GaussianBlur(one, (0, 0), shaken.get(k, 0.3 + 0.025 * (k % 9))) for k, one in enumerate(photos)]
-    findings = check_stack(lit_table.stack_of(soft))
-    assert dropped(findings) == [(f"IMG_{k}.jpg", "blurred") for k in shaken]
-
-
 @pytest.fixture(scope="module")
 def eighteen():
     rng = np.random.default_rng(3)
@@ -121,35 +108,6 @@ def test_a_changed_exposure_is_reported_but_not_held_against_the_photo(stack):
     assert finding.kind == "exposure changed" and finding.photo.name == "IMG_1.jpg" and not finding.drop
 
 
-def test_three_photos_are_too_few_to_compare_but_not_too_few_to_check(stack):
-    few = replace(stack, rgb=stack.rgb[:3], clipped=stack.clipped[:3], paths=stack.paths[:3], gains=(1.0,) * 3)
-    assert check_stack(few) == ()
-
-
-def test_a_shift_is_measured_on_faint_grain_under_noise():
-    """The scene moves, the noise does not: what moved is not hidden by what did not."""
-    rng = np.random.default_rng(4)
-    faint = lit_table.with_object(0.4 * (lit_table.table(rng) / 0.4) ** 0.25)
-    lights = [lit_table.flashlight(2 * np.pi * i / 8) for i in range(8)]
-    scenes = [moved(faint * light, 4, 0) if i == 3 else faint * light for i, light in enumerate(lights)]
-    findings = check_stack(lit_table.stack_of([lit_table.photograph(scene, rng) for scene in scenes]))
-    assert [(finding.photo.name, finding.kind) for finding in findings] == [("IMG_3.jpg", "camera moved")]
-    assert findings[0].value == pytest.approx(4, abs=0.3)
-
-
-def test_a_tripod_that_was_pushed_for_good_is_told_by_the_smaller_group(stack):
-    changed = stack
-    for place in range(8, N):
-        changed = with_photo(changed, place, moved(stack.rgb[place], 4, -3))
-    found = [(finding.photo.name, finding.kind) for finding in check_stack(changed)]
-    assert found == [(f"IMG_{place}.jpg", "camera moved") for place in range(8, N)]
-
-
-def test_a_shift_of_one_pixel_is_measured(stack):
-    (finding,) = check_stack(with_photo(stack, 3, moved(stack.rgb[3], 0.8, -0.6)))
-    assert finding.kind == "camera moved" and finding.value == pytest.approx(1, abs=0.1)
-
-
 def test_half_a_pixel_across_the_grain_of_wood_is_told_though_shadows_differ_by_more():
     """Energy tells nothing here: what the shadows' edges change is many times what the shift does."""
     rng = np.random.default_rng(6)
@@ -169,14 +127,6 @@ def test_another_scene_is_not_called_blurred(stack):
     assert dropped(check_stack(with_photo(stack, 6, soft))) == [("IMG_6.jpg", "blurred")]
 
 
-def test_something_before_the_camera_is_found_by_the_texture_that_it_hides(stack):
-    arm = stack.rgb[9].copy()
-    cv2.line(arm, (0, 60), (90, 100), (0.5, 0.3, 0.2), 40)
-    (finding,) = check_stack(with_photo(stack, 9, arm))
-    assert (finding.photo.name, finding.kind, finding.drop) == ("IMG_9.jpg", "covered", True)
-    assert 0.02 < finding.value < 0.08
-
-
 def test_room_light_in_one_photo_is_told_by_its_shadows(stack):
     usual = np.median(stack.rgb, axis=0)
     (finding,) = check_stack(with_photo(stack, 5, stack.rgb[5] + np.float32(0.12) * usual))
@@ -194,12 +144,6 @@ def in_a_room(extra, gain=1.0):
     return lit_table.stack_of([lit_table.photograph(albedo * light, rng) for light in sent])
 
 
-def test_two_percent_of_uneven_room_light_in_one_photo_are_told_where_shadows_overlap():
-    (finding,) = check_stack(in_a_room(0.02))
-    assert (finding.photo.name, finding.kind, finding.drop) == ("IMG_5.jpg", "ambient light", False)
-    assert finding.value == pytest.approx(0.02, abs=0.004)
-
-
 def test_a_shorter_exposure_that_no_file_tells_shows_in_the_room_s_light():
     (finding,) = check_stack(in_a_room(0, gain=0.63))
     assert (finding.photo.name, finding.kind, finding.drop) == ("IMG_5.jpg", "exposure changed", False)
@@ -214,38 +158,3 @@ def test_room_light_in_all_photos_is_told_of_each(stack):
     bright = replace(bright, rgb=bright.rgb + light)
     found = [finding for finding in check_stack(bright) if finding.kind == "ambient light"]
     assert len(found) == N and not any(finding.drop for finding in found)
-
-
-def test_room_light_that_photos_without_flashlight_take_off_is_not_told(stack):
-    light = np.float32(0.2) * np.median(stack.rgb, axis=0)
-    dark = replace(stack, rgb=light[None], clipped=stack.clipped[:1], paths=stack.paths[:1], gains=(1.0,))
-    assert check_stack(replace(stack, rgb=stack.rgb + light), dark) == ()
-
-
-def test_a_few_good_photos_that_lie_in_shadow_together_are_not_measured_by_themselves(stack):
-    n, size = 5, (60, 80)
-    same = np.full((n + 6, *size, 3), 0.4, np.float32)
-    for k in range(n):  # these share most of a shadow
-        same[k, 10:40, 10 + 2 * k : 40 + 2 * k] *= 0.02
-    shadows = find_shadows(lit_table.stack_of(list(same)), [k < n for k in range(len(same))])
-    assert np.nanmax(shadows.levels) < 0.03 and np.isfinite(shadows.levels).sum() == n
-
-
-def test_spread_is_the_sigma_of_normal_numbers_and_a_few_wrong_ones_hardly_change_it():
-    values = np.random.default_rng(0).normal(0.0, 3.0, 10_000)
-    assert spread(values) == pytest.approx(3.0, rel=0.03)
-    values[:200], values[200:400] = 1e6, np.nan
-    assert spread(values) == pytest.approx(3.0, rel=0.05)
-    assert column_spread(np.stack([values, 2 * values], 1))[1] == pytest.approx(2 * spread(values))
-    assert spread(np.zeros(0)) == 0.0
-
-
-def test_quantiles_of_columns_are_numpys_also_with_gaps_and_without_values():
-    values = np.random.default_rng(4).normal(size=(9, 200))
-    values[np.random.default_rng(5).random(values.shape) < 0.4] = np.nan
-    values[:, 7], values[1:, 8] = np.nan, np.nan
-    for share in (0.0, 0.6, 0.75, 1.0):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of the column without values
-            expected = np.nanquantile(values, share, axis=0)
-        np.testing.assert_allclose(column_quantile(values, share), expected, rtol=1e-12)

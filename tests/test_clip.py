@@ -59,10 +59,6 @@ def test_the_board_is_taken_from_the_room_lit_start_and_the_dark_from_the_end(ch
     assert "20 frames" in chosen.note and "room light" in chosen.note
 
 
-def test_the_same_clip_gives_the_same_frames(filmed, chosen):
-    assert choose_frames(filmed, N) == chosen
-
-
 def test_memory_is_bounded_for_long_clips(filmed, monkeypatch):
     monkeypatch.setattr(capture.session.clip, "MOST_CANDIDATES", 10)
     assert len(choose_frames(filmed, N).lit) <= 10

@@ -51,12 +51,6 @@ def looked(tmp_path_factory):
         seen.features_of = reader
 
 
-def test_roles_are_told_from_the_pictures(looked):
-    roles = {one.name: one.role for one in looked[0]}
-    assert roles.pop("IMG_0001.jpg") == "board" and set(roles.values()) == {"lit"}
-    assert not any(one.remarks for one in looked[0])
-
-
 def test_what_is_wrong_with_a_photo_is_named_at_once_and_only_new_photos_are_read(looked):
     _, second, decoded = looked
     kinds = {one.name: {kind for kind, _ in one.remarks} for one in second if one.drop}

@@ -24,10 +24,6 @@ def test_every_command_has_a_help_that_explains_each_option(capsys, command):
     assert "--debug" in text
 
 
-def test_each_kind_of_options_belongs_to_one_subcommand():
-    assert len({row.options for row in SUBCOMMANDS}) == len({row.name for row in SUBCOMMANDS}) == len(SUBCOMMANDS)
-
-
 @pytest.mark.parametrize("command", [row.name for row in SUBCOMMANDS])
 def test_no_help_speaks_of_none_or_of_what_is_not_switched_on(capsys, command):
     with pytest.raises(SystemExit):
@@ -99,14 +95,6 @@ def test_a_command_typed_wrong_is_answered_with_the_one_that_was_meant(capsys, t
     assert f"{typed} is no command; did you mean {meant}?" in capsys.readouterr().err
 
 
-def test_help_of_run_shows_first_what_everybody_needs(capsys):
-    with pytest.raises(SystemExit):
-        shadowgraph.main(["run", "--help"])
-    first, _, rest = capsys.readouterr().out.partition("research options")
-    assert all(f"--{name} " in first for name in ("out", "board", "lights", "preset", "scale", "memory", "viewer"))
-    assert all(f"--{name} " in rest for name in ("input", "split", "ablate", "field", "device", "seed", "ground"))
-
-
 def test_without_a_command_the_studio_opens(monkeypatch):
     opened = []
     monkeypatch.setattr("viewer.studio_server.serve.serve", lambda *given: opened.append(given))
@@ -123,18 +111,6 @@ def test_help_and_refusals_do_not_wait_for_torch():
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
 
 
-def test_what_imports_make_is_no_garbage_and_the_collector_goes_on():
-    code = (
-        "import gc, shadowgraph.loading\n"
-        "with shadowgraph.loading.loading():\n"
-        "    import rich.console\n"
-        "    assert not gc.isenabled()\n"
-        "print(gc.isenabled(), gc.get_freeze_count() > 1000)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=600)
-    assert done.stdout.split() == ["True", "True"], done.stderr
-
-
 @pytest.mark.parametrize("given", [None, "ACTIVE"])
 def test_threads_of_other_libraries_wait_asleep_unless_the_user_said_otherwise(given):
     environment = {key: value for key, value in os.environ.items() if key != "OMP_WAIT_POLICY"}
@@ -143,13 +119,6 @@ def test_threads_of_other_libraries_wait_asleep_unless_the_user_said_otherwise(g
     words = [sys.executable, "-c", code]
     done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600)
     assert done.stdout.split() == [given or "PASSIVE", "False"], done.stderr
-
-
-def test_an_unknown_option_ends_with_code_2(capsys):
-    with pytest.raises(SystemExit) as end:
-        shadowgraph.main(["run", "photos", "--colour"])
-    assert end.value.code == 2
-    assert "--colour" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", sorted(shadowgraph.FACADE))

@@ -79,19 +79,6 @@ def test_the_contrast_of_least_misfit_is_taken_and_the_usual_one_where_photos_sa
     assert doubt[0] <= np.median(off) < doubt[1]
 
 
-def test_linear_photos_have_no_contrast_to_be_fitted(stand_ins):
-    start = Flashlights(_lights(), 0 * _lights(), np.zeros(COUNT), np.zeros(4), 0.0, np.zeros(3))
-    fit = joint_search.at_best_contrast(start, _evidence(4000), (1.0,))
-    assert stand_ins == [1.0, 1.0]
-    assert np.max(fit.between) == 0
-
-
-def test_the_fit_says_what_the_pictures_show(stand_ins):
-    """Powers and beam are for pixel values, whatever the contrast."""
-    fit = _fitted(50)
-    np.testing.assert_array_equal(fit.evidence.log_grey, _evidence(50).log_grey)
-
-
 def test_the_stated_error_covers_the_other_fits(stand_ins):
     fit = _fitted(50)
     doubt = np.full((COUNT, 3), 40.0**2)

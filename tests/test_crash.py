@@ -7,7 +7,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from synthetic import BALL, Look, render
@@ -156,22 +155,6 @@ def test_a_fault_while_writing_a_checkpoint_leaves_the_earlier_ones_and_no_half_
         assert stored(path) in (2.0, 3.0)
 
 
-def test_a_file_reaches_the_disk_before_its_name_does_and_the_folder_after_it(tmp_path, monkeypatch):
-    calls = []
-    for name in ("fsync", "replace"):
-        real = getattr(os, name)
-        monkeypatch.setattr(
-            atomic.os, name, lambda *a, real=real, name=name: (calls.append((name, _what(a[0]))), real(*a))[1]
-        )
-    store(tmp_path / "checkpoint.safetensors", 1.0)
-    assert calls == [("fsync", "file"), ("replace", "file"), ("fsync", "folder")]
-
-
-def _what(file: int | Path) -> str:
-    path = Path(os.readlink(f"/proc/self/fd/{file}")) if isinstance(file, int) else file
-    return "folder" if path.is_dir() else "file"
-
-
 def test_the_last_two_checkpoints_are_kept_and_a_damaged_one_is_passed_over_with_a_sentence(tmp_path):
     path = tmp_path / "checkpoint.safetensors"
     for value in (1.0, 2.0, 3.0):
@@ -244,20 +227,6 @@ def test_a_killed_solve_never_makes_its_first_surface_again(is_hull, scene, tmp_
     assert resumed.messages == first.messages[3:]  # all but those of the start
 
 
-def test_a_solve_goes_on_from_the_older_checkpoint_when_the_newest_is_damaged(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
-    file, known = tmp_path / "checkpoint.safetensors", replace(scene, light_sigma=torch.zeros_like(scene.light_sigma))
-    straight = fit(known, TINY, Stop())
-    with pytest.raises(KeyboardInterrupt):
-        fit(known, TINY, Stop(35), file)
-    file.write_bytes(file.read_bytes()[:-1])
-    listener = Stop()
-    resumed = fit(known, TINY, listener, file)
-    assert any("checkpoint.safetensors is damaged" in message for message in listener.messages)
-    assert listener.steps[0] == 21
-    torch.testing.assert_close(resumed.grid.values, straight.grid.values, rtol=0, atol=0)
-
-
 def test_a_full_disk_ends_a_solve_and_keeps_its_last_checkpoint(scene, straight, tmp_path, monkeypatch):
     monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
     file = tmp_path / "checkpoint.safetensors"
@@ -274,8 +243,3 @@ def test_a_full_disk_ends_a_solve_and_keeps_its_last_checkpoint(scene, straight,
     assert before in (file.read_bytes(), previous_of(file).read_bytes())
     assert not [p.name for p in tmp_path.iterdir() if atomic.TEMPORARY in p.name]
     torch.testing.assert_close(fit(scene, TINY, Stop(), file).grid.values, straight.grid.values, rtol=0, atol=0)
-
-
-def test_the_seed_decides(scene, straight):
-    other = fit(scene, replace(TINY, seed=1), Stop())
-    assert not np.array_equal(other.grid.values.numpy(), straight.grid.values.numpy())

@@ -18,9 +18,9 @@ from reconstruct.appearance.brdf import LOBES
 from reconstruct.appearance.lobe_fit import Samples
 from reconstruct.detail import full_photos as detail_photos
 from reconstruct.detail.detail import estimate_illumination, solve_detail
-from reconstruct.detail.file import DETAIL, SURE, UNIT, load_details, save_details
+from reconstruct.detail.file import DETAIL, SURE, load_details, save_details
 from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail, specular_part
-from reconstruct.detail.full_photos import FullPhotos, PixelFile, colours_of, full_photos
+from reconstruct.detail.full_photos import FullPhotos, colours_of, full_photos
 from reconstruct.detail.merge import merged
 from reconstruct.detail.sample import detail_at, with_detail
 from reconstruct.detail.surface import Window, see_surface
@@ -29,7 +29,7 @@ from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.mesh.simplify import simplified
 from reconstruct.mesh.texture import bake, size_for
 from reconstruct.render.g_buffer import look
-from reconstruct.run.detail_stage import detail_is_asked, write_detail
+from reconstruct.run.detail_stage import write_detail
 from reconstruct.run_folder.folder import KEPT, RunFolder
 from reconstruct.run_folder.once import done_once
 from reconstruct.scene import build_scene
@@ -96,18 +96,6 @@ def test_nothing_is_claimed_along_the_outline_and_beyond_it(ball, detail):
     assert (detail.normals[detail.confidence == 0] == 0).all(-1).mean() > 0.5
 
 
-def test_places_are_read_where_the_camera_sees_them_and_nowhere_else(ball, detail):
-    towards_camera, away = np.array([0.0, -0.7, 0.7]), np.array([0.0, 0.8, 0.2])
-    centre, radius = np.array([0.0, 0, 40]), 40.0
-    places = torch.from_numpy(
-        np.stack([centre + radius * d / np.linalg.norm(d) for d in (towards_camera, away)])
-    ).float()
-    at = detail_at([detail], ball.fields.grid, places)
-    assert at.confidence[0] > 0.9 and at.confidence[1] == 0
-    true = relief_ball.bent(places[:1].double().numpy(), towards_camera[None] / np.linalg.norm(towards_camera))
-    assert relief_ball.angles(at.normals[:1].double().numpy(), true)[0] < 6
-
-
 def test_a_view_shows_the_detail_where_it_is_sure(ball, detail):
     camera = ball.calibration.camera
     plain = look(ball.fields, posed_camera=replace(ball.fields.posed_camera, camera=camera))
@@ -118,16 +106,6 @@ def test_a_view_shows_the_detail_where_it_is_sure(ball, detail):
     after = relief_ball.angles(fine.maps.normals.double().numpy()[sure], ball.normals[sure])
     assert np.median(after) < 0.5 * np.median(before)
     assert with_detail(plain, [], camera) is plain
-
-
-def test_a_smaller_view_takes_the_mean_of_the_pixels_that_it_covers(detail):
-    small = detail.reduced(4.0)
-    assert small.confidence.shape[0] == round(detail.confidence.shape[0] / 4)
-    assert small.posed_camera.camera.fx == pytest.approx(detail.posed_camera.camera.fx / 4, rel=0.02)
-    assert detail.reduced(1.2) is detail
-    sure = small.confidence > 0.95 * SURE
-    lengths = np.linalg.norm(small.normals[sure].astype(float) / UNIT, axis=-1)
-    assert lengths == pytest.approx(1, abs=1e-3)
 
 
 def test_the_baked_pictures_hold_relief_and_colour(ball, detail):
@@ -209,21 +187,6 @@ def test_reduced_photos_that_the_run_keeps_are_not_decoded_again(ball, tmp_path,
         assert whole == list(ball.paths) and run.file(DETAIL).exists()
 
 
-@pytest.mark.parametrize(
-    ("options", "due"),
-    [
-        (RunOptions(preset="fine"), True),
-        (RunOptions(preset="standard"), False),
-        (RunOptions(preset="fine", detail="off"), False),
-        (RunOptions(preset="draft", detail="on"), True),
-        (RunOptions(preset="fine", input="shadow"), False),
-    ],
-)
-def test_fine_reads_the_detail_and_others_when_asked(ball, tmp_path, options, due):
-    source = Source(tmp_path, known=KnownScene(ball.calibration, ball.paths, None, None))
-    assert detail_is_asked(source, options) == due
-
-
 def test_photos_of_another_size_than_the_calibrated_are_refused(ball):
     files = FullPhotos(ball.paths[:1], np.ones(1), np.ones((1, 3)))
     with pytest.raises(CaptureError, match="440 x 330 pixels, 880 x 660 was needed"):
@@ -231,20 +194,6 @@ def test_photos_of_another_size_than_the_calibrated_are_refused(ball):
 
 
 # --- single pixels ---------------------------------------------------------------------------------------------------
-
-
-def test_colours_are_brought_to_the_scale_of_the_stack_and_saturated_ones_are_left_out(ball, tmp_path):
-    seen = see_surface(ball.fields, ball.calibration.camera)
-    assert seen is not None
-    files = FullPhotos(ball.paths[:2], np.array([1.0, 0.5]), np.array([[1, 1, 1], [1, 1, 2.0]]))
-    size = (ball.calibration.camera.width, ball.calibration.camera.height)
-    with PixelFile(tmp_path, 2, len(seen.index)) as kept:
-        for colours in colours_of(files, seen.window, seen.index, size):
-            kept.append(colours)
-        values = kept.read(slice(0, len(seen.index)))
-        assert kept.read(slice(100, 300)) == pytest.approx(values[100:300], nan_ok=True)
-    plain = next(colours_of(FullPhotos(ball.paths[1:2], np.ones(1), np.ones((1, 3))), seen.window, seen.index, size))
-    assert values[:, 1] == pytest.approx(plain * [2, 2, 1], abs=2e-3)
 
 
 @pytest.fixture
@@ -264,24 +213,6 @@ def samples():
 
 
 NOISE = Noise(1e-4, 0.01)
-
-
-def test_shadows_of_small_relief_are_left_out_though_the_surface_says_lit(samples):
-    true, given = samples
-    given.value[:, 3:5] = 0
-    normals, trust = fit_detail(given, torch.full((200,), 0.5), NOISE, None)
-    assert relief_ball.angles(normals.double().numpy(), true.double().numpy()).mean() < 1.5
-    assert trust.mean() > 0.9
-
-
-def test_pixels_that_no_light_surely_reaches_keep_the_normal_of_their_surface(samples):
-    _, given = samples
-    dark = replace(given, weight=torch.zeros(200, 12))
-    normals, trust = fit_detail(dark, torch.full((200,), 0.5), NOISE, None)
-    assert (trust == 0).all()
-    assert relief_ball.angles(normals.double().numpy(), given.normals.double().numpy()).max() < 0.1
-    _, photos = fit_albedo(dark, normals, None)
-    assert (photos == 0).all()
 
 
 def test_the_solved_gloss_is_taken_off(samples):
@@ -361,29 +292,6 @@ def test_a_place_gets_the_detail_of_the_view_that_sees_it_in_the_frame_of_all(bo
         true = relief_ball.bent(places, outward)
         assert np.median(relief_ball.angles(at.normals.double().numpy(), true)) < 2.5
         assert np.median(relief_ball.angles(outward, true)) > 4
-
-
-def test_where_two_views_see_a_place_their_mean_is_no_worse_and_has_no_seam(both, detail):
-    fields, details = both
-    eye = detail.posed_camera.centre
-    places, outward = on_ball(np.degrees(np.arctan2(eye[1], eye[0])) - 60)
-    points = torch.from_numpy(places).float()
-    each = [detail_at([one], fields.grid, points) for one in details]
-    shared = ((each[0].confidence > 0.5) & (each[1].confidence > 0.5)).numpy()
-    assert shared.sum() > 50
-    true = relief_ball.bent(places, outward)[shared]
-    off = [
-        np.median(relief_ball.angles(one.normals.double().numpy()[shared], true))
-        for one in (*each, detail_at(details, fields.grid, points))
-    ]
-    assert off[2] < 1.05 * min(off)
-
-
-def test_the_albedo_of_one_of_several_views_is_in_the_scale_that_they_have_in_common(both):
-    _, (first, second) = both
-    sure = [one.confidence > 0.9 * SURE for one in (first, second)]
-    means = [one.albedo[where].astype(float).mean(0) for one, where in zip((first, second), sure, strict=True)]
-    assert means[1] / means[0] == pytest.approx(1.3, rel=0.04)
 
 
 def test_the_details_of_all_views_come_back_from_one_file(both, tmp_path):

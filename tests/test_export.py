@@ -1,6 +1,5 @@
 """Truth: the heap of balls and a box; every file is read back by another program than the one that wrote it."""
 
-import io
 import json
 import re
 import struct
@@ -18,12 +17,9 @@ import shadowgraph
 from capture.decode.exr import read_exr
 from capture.errors import ReconstructionError
 from reconstruct.export import formats
-from reconstruct.export.export import ExportOptions, _imported, export, format_for
+from reconstruct.export.export import ExportOptions, _imported, export
 from reconstruct.export.maps import read_map
 from reconstruct.mesh.simplify import bounds_a_solid
-from reconstruct.render import relight, studio
-from reconstruct.render.g_buffer import seen_material
-from reconstruct.render.studio import around, studio_of, turntable
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.report.formats import FORMATS
 
@@ -65,10 +61,6 @@ def test_a_format_is_added_behind_another_and_only_once(monkeypatch):
         formats.add_format("d", FORMATS["off"], after="c")
 
 
-def test_titles_can_be_told_apart():
-    assert len({row.title for row in FORMATS.values()}) == len(FORMATS)
-
-
 @pytest.mark.parametrize("name", ["ply", "stl", "off"])
 def test_a_mesh_to_measure_is_closed_in_millimetres_and_z_up(run, full, tmp_path, name):
     it = written(run, tmp_path, name)
@@ -77,11 +69,6 @@ def test_a_mesh_to_measure_is_closed_in_millimetres_and_z_up(run, full, tmp_path
     assert np.allclose(mesh.bounds, full.bounds, atol=0.6)  # a third of a voxel
     assert bounds_a_solid(mesh.vertices, mesh.faces)
     assert "mm" in it.sentence() and f"{it.contents.faces:,} triangles" in it.sentence()
-
-
-def test_the_full_mesh_is_the_runs_own(run, tmp_path):
-    it = export(run, "ply", tmp_path / "it.ply")
-    assert it.path.read_bytes() == (run / "mesh.ply").read_bytes()
 
 
 def test_a_3mf_is_closed_in_millimetres_and_stands_on_its_bed(run, full, tmp_path):
@@ -193,36 +180,6 @@ def test_an_mp4_is_what_browsers_play(run, tmp_path):
     assert (tmp_path / "it.mp4").read_bytes().index(b"moov") < 100  # in front: it starts before it is there
 
 
-def test_a_turn_reads_the_material_once_and_casts_many_rays_only_at_soft_edges(run, monkeypatch):
-    counted = {"material": 0, "pixels": 0, "soft": 0}
-
-    def material(fields):
-        counted["material"] += 1
-        return seen_material(fields)
-
-    def surely_seen(view, lit, *others):
-        sure = known(view, lit, *others)
-        counted["pixels"] += len(sure)
-        counted["soft"] += int((~sure).sum())
-        return sure
-
-    known = relight._surely_seen
-    monkeypatch.setattr(studio, "seen_material", material)
-    monkeypatch.setattr(relight, "_surely_seen", surely_seen)
-    stored = StoredRun(run)
-    pictures = list(turntable(stored.fields, studio_of(np.asarray(stored.mesh.bounds)), 160, 4))
-    assert len(pictures) == 4 and counted["material"] == 1
-    assert counted["pixels"] > 4 * 5000 and counted["soft"] < 0.7 * counted["pixels"], counted
-
-
-def test_the_last_picture_of_a_turn_leads_into_the_first(run):
-    it = StoredRun(run)
-    studio = studio_of(np.asarray(it.mesh.bounds))
-    poses = [around(studio, it.fields, 2 * np.pi * k / 12, 160).centre for k in range(13)]
-    steps = np.linalg.norm(np.diff(poses, axis=0), axis=1)
-    assert np.ptp(steps) < 1e-6 and np.allclose(poses[0], poses[12])
-
-
 # --- what is refused -------------------------------------------------------------------------------------------------
 
 
@@ -271,12 +228,6 @@ def test_without_a_file_it_goes_into_the_runs_own_folder(run, capsys):
     assert "mm" in capsys.readouterr().out
 
 
-def test_the_format_follows_from_the_ending():
-    assert format_for(Path("a.GLB"), None) == "glb"
-    assert format_for(Path("a.webm"), None) == "turntable"
-    assert format_for(Path("a.webm"), "orbit") == "orbit"
-
-
 def test_missing_packages_are_named(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "reconstruct.mesh.usd", None)
     with pytest.raises(ReconstructionError, match=r"pip install 'shadowgraph\[usd\]'"):
@@ -284,11 +235,3 @@ def test_missing_packages_are_named(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(ReconstructionError, match=r"pip install 'shadowgraph\[video\]'"):
         written(run, tmp_path, "turntable")
-
-
-def test_pictures_in_a_glb_are_png(run, tmp_path):
-    data = written(run, tmp_path, "glb").path.read_bytes()
-    starts = [found.start() for found in re.finditer(b"\x89PNG", data)]
-    assert len(starts) == 2
-    for start in starts:
-        assert Image.open(io.BytesIO(data[start:])).size == (128, 128)

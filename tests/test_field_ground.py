@@ -14,7 +14,6 @@ from reconstruct.labels.photometric_stereo import label_object, with_free_powers
 from reconstruct.scene import Scene, ground_points
 
 LOOK = Look(width=160, height=120, n_lights=20, texture=0.2, ambient=0.05)
-ARCH = (Box((-45, -15, 0), (-20, 15, 60)), Box((20, -15, 0), (45, 15, 60)), Box((-45, -15, 60), (45, 15, 80)))
 
 
 def spotted(scene: Scene, seed: int = 0) -> tuple[Scene, np.ndarray]:
@@ -61,18 +60,6 @@ def test_the_field_labels_what_the_lights_model_cannot(heap):
     assert found.albedo.isfinite().all() and found.gain.isfinite().all() and found.ambient > 0
 
 
-SLAB = Box((-40.0, -30.0, 0.0), (40.0, 30.0, 15.0), (0.6, 0.6, 0.6))
-
-
-@pytest.mark.parametrize("shapes", [HEAP, (BALL,), (SLAB,)])
-def test_photos_that_the_lights_model_explains_are_labelled_by_it(shapes):
-    scene, truth = render(shapes, LOOK)
-    found, usual = label_ground(scene), by_the_lights(scene)
-    assert found.bare is None and usual.explained > 0.8
-    assert wrong_labels(found, truth) < 0.02
-    assert overlap(found.mask.numpy() > 0.5, truth.mask) > overlap(usual.mask.numpy() > 0.5, truth.mask) - 0.005
-
-
 @pytest.mark.parametrize(("radius", "albedo"), [(20.0, 0.02), (25.0, 0.02), (20.0, 0.03)])
 def test_a_nearly_black_thing_on_ground_without_an_end_is_object(radius, albedo):
     """The lights' model alone finds an albedo and a shadow for each of its pixels."""
@@ -80,20 +67,6 @@ def test_a_nearly_black_thing_on_ground_without_an_end_is_object(radius, albedo)
     scene, truth = render((ball,), replace(LOOK, noise=0.01))
     assert overlap(by_the_lights(scene).mask.numpy() > 0.5, truth.mask) < 0.6
     assert overlap(label_ground(scene).mask.numpy() > 0.5, truth.mask) > 0.9
-
-
-def test_lights_that_move_leave_the_field_as_it_is(heap):
-    scene, _ = heap
-    first = label_ground(scene)
-    moved = label_ground(replace(scene, lights=scene.lights * torch.tensor([1.02, 1.02, 1.02, 1.0])), first)
-    assert moved.bare is first.bare
-    assert torch.equal(moved.visibility, first.visibility)
-
-
-def test_ground_between_feet_is_no_object():
-    scene, truth = render(ARCH, LOOK)
-    bare = label_ground(spotted(scene)[0]).bare
-    assert bare is not None and overlap(bare.shadows.object_mask, truth.mask) > 0.85
 
 
 def test_powers_follow_the_object_and_its_normals_with_them():
@@ -111,12 +84,6 @@ def test_powers_follow_the_object_and_its_normals_with_them():
         return float(np.degrees(np.arccos(np.clip((normals * truth.normals[truth.mask]).sum(-1), -1, 1))).mean())
 
     assert error(freed) < 0.8 * error(scene)
-
-
-def test_powers_of_photos_that_the_lights_model_explains_stay():
-    scene, truth = render((BALL,), LOOK)
-    points = torch.from_numpy(truth.points).float()
-    assert with_free_powers(scene, points, None, label_ground(scene)) is scene
 
 
 def test_shadows_lie_where_they_can_reach():

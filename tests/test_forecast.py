@@ -13,7 +13,6 @@ from reconstruct.run.presets import preset
 from reconstruct.run_folder.folder import Progress
 from reconstruct.run_folder.forecast import STAGE_NAMES, Forecast, left_text, plan_numbers
 from shadowgraph.terminal import Display
-from viewer.display.run_follower import status
 
 PLANNED = {
     "capture": 4.0,
@@ -90,20 +89,6 @@ def test_the_bar_never_goes_back_and_the_time_left_never_jumps(times):
     off = 4.0 if is_sudden else 2.2
     assert end / 2 / off <= half[2] <= end / 2 * off
     assert shown[-1] < 0.1 * end + 3
-
-
-def test_a_run_that_goes_on_plans_what_is_left_of_it():
-    before = list(lines_of({}))[:120]
-    t = before[-1]["t"]
-    plan = {name: PLANNED[name] for name in ("capture", "solve", "mesh", "report")}
-    forecast = Forecast([*before, line(t, "capture", numbers=plan_numbers(plan)), line(t + 4, "solve", 90, 144)])
-    forecast.at(t + 4)
-    assert 10 <= forecast.left_s <= 25 and forecast.share > 0.5
-
-
-def test_a_run_without_a_plan_is_as_far_as_its_stage():
-    now = status([line(9, "solve", 34, 120) | {"eta_s": 40.0}], True)
-    assert (now.fraction, now.eta_s) == (pytest.approx(34 / 120), 40.0)
 
 
 @pytest.mark.parametrize(

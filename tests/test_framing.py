@@ -14,12 +14,10 @@ from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.reframed import UNPLACED, Doubt, reframed, with_doubt
 from capture.checks.framing import (
-    NOT_COMPARED,
     NOT_SHOWN,
     REFRAMED,
     SEEN_FROM,
     ZOOM_STATED,
-    _framing,
     framing_findings,
 )
 from capture.checks.moved_photos import check_and_register
@@ -70,21 +68,6 @@ def framed(stack: PhotoStack, board: PhotoStack):
     return framing_findings(stack, range(len(stack.paths)), board)
 
 
-def test_photos_of_the_board_s_view_are_not_spoken_of(stack, board):
-    assert framed(stack, board) == []
-
-
-@pytest.mark.parametrize(("resting", "moves"), [(11, False), (7, True)])
-def test_a_motion_that_explains_hardly_more_than_a_picture_that_stands_still_is_chance(resting, moves):
-    rng = np.random.default_rng(4)
-    places = rng.uniform(60, 420, (resting + 14, 2)).astype(np.float32)
-    words = rng.normal(size=(len(places), 128)).astype(np.float32)  # each point is like itself alone
-    there = places.copy()
-    there[resting:] = cv2.transform(places[resting:, None], about_middle(1.1, 8)[:2])[:, 0] + 20
-    found = _framing((places, words), (there, words), 1.0)
-    assert found is not None and (found.motion(640, 480) > 20) == moves
-
-
 @pytest.mark.parametrize(("scale", "degrees"), [(1.1, 0), (1.3, 0), (0.9, 0), (1.0, 180), (1.1, 180)])
 def test_a_zoom_and_a_turn_of_the_photos_are_measured_and_allowed_for(stack, board, scale, degrees):
     true = about_middle(scale, degrees)
@@ -131,13 +114,6 @@ def test_a_zoom_that_only_exif_states_is_named_where_no_texture_tells(stack, boa
     camera, notes, doubt = reframed(here, plain, found)
     assert notes == [] and doubt.share == pytest.approx(36 / 27 - 1) and not doubt.is_of_place
     assert camera.camera.sigmas["fx"] > 0.3 * CAMERA.fx and replace(camera, camera=CAMERA) == here
-
-
-def test_a_table_without_texture_is_not_accused_but_said_to_tell_nothing(stack, board):
-    plain = replace(stack, rgb=np.full_like(stack.rgb, 0.3))
-    (found,) = framed(plain, replace(board, rgb=np.full_like(board.rgb, 0.3)))
-    assert (found.kind, found.drop, found.homography) == (NOT_COMPARED, False, None)
-    assert reframed(posed((0.0, -300.0, 250.0)), plain, [found])[1] == [f"T{found.text[1:]}."]
 
 
 def test_doubt_of_the_view_widens_the_sigmas_of_lights():

@@ -16,7 +16,6 @@ from capture.decode.exif import read_header
 from capture.errors import CaptureError
 from capture.session.session import load_session
 from examples.generator import hand, poses
-from examples.generator.beam import WARM_WHITE, WIDEST_DEG, beam, leds
 from examples.generator.options import (
     Exposure,
     Flashlight,
@@ -26,7 +25,6 @@ from examples.generator.options import (
     Setup,
     Table,
     Thing,
-    switched_on,
 )
 from examples.generator.sheet import lay
 
@@ -44,27 +42,6 @@ def scene(setup: Setup) -> tuple[trimesh.Trimesh, poses.Viewpoint]:
 def never(start: np.ndarray, along: np.ndarray) -> np.ndarray:
     """Return that nothing is in the way of rays."""
     return np.zeros(len(along), bool)
-
-
-def test_hard_switches_everything_on_and_keeps_what_is_set_by_hand():
-    plain = Setup(table=Table(wall=500.0))
-    assert switched_on(plain) is plain
-    hard = switched_on(replace(plain, hard=True))
-    assert hard.table.wall == 500.0 and hard.table.varnish > 0 and hard.table.wavy > 0
-    assert hard.pipeline.pipeline and hard.flashlight.optics == "two-leds" and hard.exposure.ambient > 0.05
-    events = [*hard.hand.arm, *hard.hand.shaken, *hard.hand.no_flash, *hard.hand.tapped, *hard.hand.twice]
-    assert len(set(events)) == len(events) == 6
-
-
-def test_an_effect_leaves_the_flashlights_of_the_others_alone():
-    plain = Setup()
-    other = replace(plain, table=Table(wavy=1.0, varnish=0.5), hand=Hand(arm=(2,), tapped=(4,)))
-    thing, _ = scene(plain)
-    places = [
-        [lamp.position for lamp in poses.lamps(setup, 6, thing, BOARD, np.random.default_rng(0))]
-        for setup in (plain, other)
-    ]
-    assert np.array_equal(*places)
 
 
 def test_flashlights_stay_before_the_wall_and_hand_held_phones_too():
@@ -92,85 +69,6 @@ def test_side_views_hold_object_and_board():
         off = view.world_from_camera.translation - thing.bounds.mean(0)
         tripod = fixed.world_from_camera.translation - thing.bounds.mean(0)
         assert off[:2] @ tripod[:2] < 0.9 * np.linalg.norm(off[:2]) * np.linalg.norm(tripod[:2])
-
-
-def test_the_flashlight_phones_led_is_the_flashlight():
-    setup = Setup()
-    thing, _ = scene(setup)
-    camera = poses.light_phone(320)
-    for lamp in poses.lamps(setup, 5, thing, BOARD, np.random.default_rng(0)):
-        view = poses.from_the_light(lamp, camera, np.random.default_rng(1))
-        assert np.allclose(view.world_from_camera.apply(np.array(poses.LED_FROM_LENS_MM)), lamp.position)
-        assert np.allclose(view.world_from_camera.rotation[:, 2], lamp.axis)
-
-
-def test_an_askew_grip_misses_the_object_in_the_same_way_each_time():
-    setup = Setup(flashlight=Flashlight(aim_error=0.0, aim_off=12.0))
-    thing, _ = scene(setup)
-    centre = thing.bounds.mean(0)
-    for lamp in poses.lamps(setup, 8, thing, BOARD, np.random.default_rng(0)):
-        towards = (centre - lamp.position) / np.linalg.norm(centre - lamp.position)
-        assert np.degrees(np.arccos(towards @ lamp.axis)) == pytest.approx(12, abs=0.01)
-
-
-def test_the_even_beam_is_half_at_its_half_angle_and_an_led_has_centre_ring_and_colour():
-    angles = np.array([0.0, 24.0, 34.0, 45.0, WIDEST_DEG + 1])
-    cosines = np.cos(np.radians(angles))
-    even = beam(cosines, Flashlight(beam=45.0))
-    assert even[0] == pytest.approx(1) and even[3] == pytest.approx(0.5) and not even[4].any()
-    led = beam(cosines, Flashlight(optics="led"))
-    assert led[0] == pytest.approx(1, abs=0.01) and led[1, 0] < 0.45 and not led[4].any()
-    around = beam(np.cos(np.radians(np.arange(60.0))), Flashlight(optics="led"))[:, 0]
-    assert (np.diff(around) > 0).any()  # a ring: not falling everywhere
-    assert led[3, 2] / led[3, 0] < led[0, 2] / led[0, 0] - 0.1  # bluer in the middle
-
-
-def test_two_leds_are_the_light_of_one():
-    pair = leds(Flashlight(optics="two-leds"))
-    assert sum(led.share for led in pair) == 1 and sum(led.aside_mm for led in pair) == 0
-    assert np.allclose(np.sum([led.share * np.array(led.colour) for led in pair], axis=0), WARM_WHITE)
-
-
-def test_a_wavy_sheet_lies_between_the_table_and_its_height():
-    assert np.array_equal(lay(BOARD, Setup()).corners(), BOARD.points())
-    laid = lay(BOARD, Setup(table=Table(wavy=0.8)))
-    heights = laid.height(laid.grid())
-    assert heights.min() == pytest.approx(0) and heights.max() == pytest.approx(0.8)
-    assert np.array_equal(laid.corners()[:, :2], BOARD.points()[:, :2])
-    assert np.abs(np.diff(heights)).max() < 0.05  # paper bends, it does not break
-
-
-def test_a_tap_shifts_the_picture_for_good_and_as_far_as_told():
-    setup = Setup(flashlight=Flashlight(photos=6), hand=Hand(tapped=(3,), tapped_px=6.0))
-    thing, fixed = scene(setup)
-    found = hand.views(fixed, setup)
-    assert found[0] is fixed and found[1] is fixed and found[2] is found[5]
-    middle = thing.bounds.mean(0)
-    at = [v.camera.project(v.world_from_camera.inverse().apply(middle)) for v in (fixed, found[2])]
-    assert np.linalg.norm(at[1] - at[0]) == pytest.approx(6, abs=2)  # the tripod slid a little, too
-
-
-def test_a_shaken_photo_is_blurred_and_not_brighter():
-    camera = Camera(160, 120, 150.0, 150.0, 80.0, 60.0)
-    dot = np.zeros((120, 160, 3), np.float32)
-    dot[60, 80] = 1
-    out = hand.shaken(dot, camera, 60.0, np.random.default_rng(0))
-    assert out.sum() == pytest.approx(dot.sum(), rel=0.02) and out.max() < 0.3
-    rows, columns = np.nonzero(out[..., 0] > 0.01)
-    assert np.hypot(np.ptp(rows), np.ptp(columns)) == pytest.approx(60 * 160 / 1008, abs=4)
-
-
-def test_an_arm_reaches_into_the_picture_and_touches_nothing():
-    setup = Setup()
-    thing, fixed = scene(setup)
-    for seed in range(4):
-        mesh, colour = hand.arm(fixed, thing, np.random.default_rng(seed))
-        assert len(colour) == len(mesh.vertices) and mesh.bounds[0, 2] > 0
-        to_object = np.linalg.norm(mesh.vertices - thing.bounds.mean(0), axis=1).min()
-        assert to_object > 40 + 10
-        pixels = fixed.camera.project(fixed.world_from_camera.inverse().apply(mesh.vertices))
-        inside = np.all((pixels > 0) & (pixels < [fixed.camera.width, fixed.camera.height]), axis=1)
-        assert 0.05 < inside.mean() < 1
 
 
 def test_photos_that_there_are_not_cannot_be_spoilt():

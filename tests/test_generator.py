@@ -21,7 +21,7 @@ from capture.photos.photo import read_photo
 from capture.session.session import load_session
 from examples.generator.lens import lens_of
 from examples.generator.options import Around, Exposure, Flashlight, Further, Phone, Setup, Table, Thing
-from examples.generator.shapes import SOLIDS, build
+from examples.generator.shapes import build
 from reconstruct.evaluate.metrics import evaluate
 
 BOARD = "checkerboard:5x4:36"
@@ -50,14 +50,6 @@ def capture(tmp_path_factory):
 
 def truth(capture, name):
     return json.loads((capture / "gt" / f"{name}.json").read_text())
-
-
-def test_every_built_in_shape_is_one_closed_body_on_the_table():
-    for name in SOLIDS:
-        mesh = build(name, cells=60)
-        assert mesh.is_watertight and mesh.volume > 0, name
-        assert mesh.body_count == 1, name
-        assert abs(mesh.bounds[0, 2]) < 0.1, name
 
 
 def test_a_lens_puts_a_point_where_the_camera_projects_it():

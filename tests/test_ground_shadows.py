@@ -53,11 +53,6 @@ def test_what_lies_beyond_a_walls_foot_is_no_ground():
     np.testing.assert_array_equal(one.likelihood[below], shadows.likelihood[below])
 
 
-def test_ground_without_a_line_across_stays_as_it_is():
-    shadows = find_shadows(_field(FIGURE))
-    np.testing.assert_array_equal(of_one_ground(shadows).likelihood, shadows.likelihood)
-
-
 def test_lights_whose_stated_error_is_large_are_notsurely_placed():
     """They are used, and yet outlines are asked: powers that differ contradict the shading."""
     places = np.array([[0.0, 0.0, 500.0]] * 4)
@@ -93,29 +88,6 @@ def test_print_that_is_too_dark_to_show_shadows_stays_ground():
     assert found[figure].mean() > 0.9 and not found[square].any()
 
 
-def _inside_a_frame(step: float) -> np.ndarray:
-    """What is found of the inside of a frame whose right side is hard to see.
-
-    step: log units by which the inside is brighter or darker than the ground, in turns.
-    """
-    whole, inside = (np.abs(COLUMNS - 80) < 24) & (np.abs(ROWS - 60) < 16), np.zeros(ROWS.shape, bool)
-    inside[46:70, 62:102] = True
-    right, turns = whole & (COLUMNS > 101), np.array([-1, 1, -1, 1, -1, 1])[:, None]
-    field = _field(whole & ~inside & ~right)
-    field.residual[:, inside] += step * turns
-    field.residual[:, right] = 0.088 * turns  # log likelihood ratio -0.2: nearly ground
-    return find_shadows(field).object_mask[inside]
-
-
-def test_a_level_top_nearer_to_the_lights_is_lit_otherwise_than_the_ground():
-    """A chair's seat: nothing behind it is hidden from many lights, and its brightness changes with each light."""
-    assert _inside_a_frame(0.06).mean() > 0.95
-
-
-def test_what_a_frame_encloses_stays_ground_where_it_is_lit_as_the_ground_is():
-    assert _inside_a_frame(0.01).mean() < 0.05
-
-
 def _two_boxes(step: float) -> tuple[np.ndarray, ...]:
     """Two boxes, the upper one above the larger lower one: the sides of both, what lies between, and what is found.
 
@@ -136,34 +108,6 @@ def test_what_stands_on_a_level_top_belongs_to_the_object_and_the_top_too():
     assert (found & ~lower & ~upper & ~top).sum() < 0.1 * top.sum()
 
 
-def test_a_thing_behind_the_object_with_ground_between_is_another():
-    lower, upper, top, found = _two_boxes(0.0)
-    assert found[lower].mean() > 0.95 and not found[upper].any() and found[top].mean() < 0.05
-
-
-def _table(step: float) -> tuple[np.ndarray, np.ndarray]:
-    """A table's top, whose near edge and sides are seen but not its far edge, and what is found.
-
-    step: log units by which the top is brighter or darker than the ground, in turns.
-    """
-    whole = (np.abs(COLUMNS - 80) < 40) & (np.abs(ROWS - 60) < 20)
-    top = (np.abs(COLUMNS - 80) < 38) & whole & (ROWS < 76)
-    field = _field(whole & ~top)
-    field.residual[:, top] += step * np.array([-1, 1, -1, 1, -1, 1])[:, None]
-    return top, find_shadows(field).object_mask
-
-
-def test_a_level_top_that_nothing_encloses_is_told_by_its_light():
-    """A table's: its far edge is not seen before the ground behind it."""
-    top, found = _table(0.06)
-    assert found[top].mean() > 0.95 and (found & (ROWS < 40)).sum() < 0.05 * top.sum()
-
-
-def test_ground_that_is_seen_above_the_object_past_its_sides_stays_ground():
-    top, found = _table(0.01)
-    assert found.any() and found[top].mean() < 0.05
-
-
 @pytest.mark.parametrize("look", [(-0.7, 0.0, 0.0), (0.0, 0.5, -0.3), (0.4, -0.3, 0.2)])
 def test_a_part_that_is_lit_nearly_as_the_ground_is_told_by_its_look(look):
     """A mug of one look throughout: darker, of another hue, or brighter. Its top is nearly as bright as the ground."""
@@ -179,13 +123,6 @@ def test_a_part_that_is_lit_nearly_as_the_ground_is_told_by_its_look(look):
     )
     assert alike[top].mean() < 0.1
     assert other[whole].mean() > 0.95 and (other & ~whole).sum() < 0.05 * whole.sum()
-
-
-def test_print_that_is_lit_as_the_ground_stays_ground_though_it_looks_like_no_other_ground():
-    printed = (np.abs(COLUMNS - 130) < 8) & (np.abs(ROWS - 30) < 8)
-    field = _field(FIGURE)
-    found = find_shadows(replace(field, albedo=np.where(printed, -1.0, field.albedo).astype(np.float32))).object_mask
-    assert found[FIGURE].mean() > 0.95 and not found[printed].any()
 
 
 @pytest.mark.parametrize("width", [4, 8, 12])

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from synthetic import BALL, Look, Sphere, render
+from synthetic import BALL, Look, render
 from test_solver import Listener
 
 from calibration.camera import Camera
@@ -30,9 +30,7 @@ from reconstruct.labels.supervision import supervise
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import find_surface
 from reconstruct.solve.solver import fit
-from reconstruct.solve.trials import hull_is_better
 
 EYE_MM, WIDTH = 400.0, 48
 QUICK = HeightConfig(iterations=(30, 50))
@@ -119,17 +117,6 @@ def test_a_light_ray_is_a_straight_line_over_the_field():
     assert place == 10 and (x, y) == (16, 6) and not beneath
     scale = np.clip(rise, height_kernels.FLATTEST, height_kernels.STEEPEST)
     assert margin == pytest.approx((height - peak) / scale, rel=0.01)
-
-
-def test_a_ray_may_pass_beneath_what_hangs():
-    heights, undersides = np.zeros((48, 48), np.float32), np.full((48, 48), -2.0, np.float32)
-    heights[:, 14:18], undersides[:, 14:18] = 20.0, 12.0
-    light = np.array([60.0, 0.0, -8.0, 1.0])
-    light[1] = (2 - 20) / 50 * light[2]
-    blocked = one_ray(heights, np.full((48, 48), -2.0, np.float32), light)
-    free = one_ray(heights, undersides, light)
-    assert blocked[0] < 0 and blocked[5]  # nearest way out is below: the underside is asked to rise
-    assert free[0] > 0
 
 
 def test_the_gradient_of_the_heights_is_that_of_the_error():
@@ -247,12 +234,6 @@ def test_the_start_is_a_height_field_only_where_there_is_no_ground_to_carve_with
     assert isinstance(start(replace(scene, mask=None)), HeightStart)
 
 
-@pytest.mark.slow  # a small solve from each start
-def test_held_out_rays_choose_heights_for_a_relief_from_above():
-    above, _ = seen_from_above(waves(30.0), lights_around(4), (waves(30.0) < 385).astype(float))
-    assert isinstance(choose_start(above, Observer(above), FitConfig(), judge=hull_is_better), HeightStart)
-
-
 def judges(scene, labels):
     """The rays that judge a height field and the free surface that begins with it."""
     rays = supervise(scene, labels)
@@ -272,22 +253,6 @@ def test_a_whole_solve_without_ground_or_mask_explains_rays_it_has_not_seen():
     held_out = judges(scene, assemble_labels(scene, None, None))
     flat = float((held_out.weight * (1 - held_out.label)).sum() / held_out.weight.sum())  # all lit
     assert held_out.error(fields.grid, scene) < 0.5 * flat
-
-
-def test_held_out_rays_prefer_the_truth():
-    scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=8))
-    labels = assemble_labels(replace(scene, rgb=None), None, None)
-    held_out = judges(scene, labels)
-    axis = torch.linspace(-50, 50, 60)
-    nodes = torch.stack(torch.meshgrid(axis, axis, axis + 45, indexing="ij"), -1)
-
-    def ball(radius: float) -> SdfGrid:
-        centre = torch.tensor(BALL.centre)
-        return SdfGrid((nodes - centre).norm(dim=-1) - radius, nodes[0, 0, 0], float(axis[1] - axis[0]))
-
-    assert held_out.error(ball(40.0), scene) < 0.02 < held_out.error(ball(30.0), scene)
-    assert np.isfinite(find_surface(ball(40.0), scene.eye[None], scene.forward[None]).numpy()).all()
-    assert isinstance(BALL, Sphere) and truth.mask.any()
 
 
 def test_the_start_is_judged_by_its_labels_that_were_read_and_by_no_others():

@@ -6,17 +6,15 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import label
-from synthetic import BALL, HEAP, Box, Look, Sphere, default_camera, render
+from synthetic import BALL, HEAP, Box, Look, default_camera, render
 
 from calibration.camera import Camera
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.side_view import SideView
 from capture.errors import ReconstructionError
-from reconstruct.hull.hull_parts import PixelRays, most_needed
 from reconstruct.hull.shadow_hull import shadow_hull
 from reconstruct.labels.labels import assemble_labels
-from reconstruct.sdf import carve_kernels
 
 LOOK = Look(with_shadow=True, with_mask=True, n_lights=24)
 
@@ -63,15 +61,6 @@ def test_a_photo_from_the_side_carves_what_few_lights_leave_and_nothing_else():
     assert (held.values.numpy() < 0)[deep].mean() > 0.97
 
 
-def test_the_box_holds_two_objects():
-    pair = (Sphere((-45.0, 0.0, 25.0), 25.0), Sphere((45.0, 10.0, 20.0), 20.0))
-    scene, _ = render(pair, LOOK)
-    grid = shadow_hull(scene, labels_of(scene), votes=1, nodes=48)
-    for ball in pair:
-        centre = torch.tensor([ball.centre])
-        assert float(grid.sdf(centre)) < 0
-
-
 def test_an_object_nearly_as_high_as_the_camera_is_not_cut():
     camera, pose = default_camera(LOOK.width, LOOK.height)
     wide = replace(camera, fx=70.0, fy=70.0)
@@ -79,14 +68,6 @@ def test_an_object_nearly_as_high_as_the_camera_is_not_cut():
     scene, _ = render((column,), LOOK, (wide, pose))
     grid = shadow_hull(scene, labels_of(scene), votes=1, nodes=40)
     assert float(grid.sdf(torch.tensor([[0.0, 0.0, 280.0]]))) < 0
-
-
-def test_an_object_of_a_few_pixels_is_found():
-    scene, truth = render((Sphere((0.0, 0.0, 4.0), 4.0),), replace(LOOK, width=240, height=180))
-    assert truth.mask.sum() < 0.002 * truth.mask.size
-    grid = shadow_hull(scene, labels_of(scene), votes=2, nodes=40)
-    assert float(grid.sdf(torch.tensor([[0.0, 0.0, 4.0]]))) < 0
-    assert float(grid.upper()[2]) < 20
 
 
 def test_one_wrong_light_is_forgiven_by_a_second_vote():
@@ -117,46 +98,3 @@ def test_few_lights_leave_no_floating_parts_between_camera_and_object(lights):
     distance = truth.sdf(nodes.reshape(-1, 3)).reshape(inside.shape)
     assert inside[(distance < -2.5 * grid.spacing) & (nodes[..., 2] > 0)].mean() > 0.95  # the object is still in it
     assert grid.spacing < 5  # mm: its box is not that of what floats, which was twice as long
-
-
-@pytest.mark.parametrize(("rows", "needs"), [(4, 2), (1, 1)])
-def test_where_object_pixels_meet_hardly_any_node_that_enough_lights_need_fewer_are_enough(rows, needs):
-    inside, needed = np.ones((12, 12, 12), bool), np.ones((12, 12, 12), np.uint8)
-    needed[:, : 3 * rows : 3] = 2  # a pixel meets these rows and their neighbours
-    nodes = np.arange(12**3, dtype=np.int32).reshape(12, 144)  # one ray through each node of the first layer
-    rays = PixelRays(nodes, np.ones(nodes.shape, bool), np.arange(12, dtype=np.float32), np.arange(144))
-    enough, keep = most_needed(inside, needed, inside, 2, [rays])
-    assert enough == needs and keep.sum() == (needed >= needs).sum()
-    assert not rays.meet(np.zeros_like(inside)).any()
-
-
-def test_a_node_that_no_light_denies_needs_two_lights_only():
-    inside, needed = np.ones((2, 2, 4), bool), np.array([1, 2, 2, 3], np.uint8)[None, None].repeat(2, 0).repeat(2, 1)
-    denied = np.zeros(inside.shape, bool)
-    denied[..., 2] = True
-    rays = PixelRays(np.arange(16, dtype=np.int32).reshape(1, 16), np.ones((1, 16), bool), np.zeros(1), np.arange(16))
-    enough, keep = most_needed(inside, needed, denied, 3, [rays])
-    assert enough == 3 and keep[0, 0].tolist() == [False, True, False, True]
-
-
-def test_a_hanging_object_that_pixels_need_stays():
-    pair = (Sphere((-50.0, 0.0, 25.0), 25.0), Sphere((50.0, 0.0, 90.0), 20.0))
-    scene, _ = render(pair, LOOK)
-    grid = shadow_hull(scene, labels_of(scene), votes=1, nodes=48)
-    for ball in pair:
-        assert float(grid.sdf(torch.tensor([ball.centre]))) < 0
-
-
-@pytest.mark.parametrize("votes", [1, 2])
-def test_nodes_that_the_camera_proves_empty_need_no_light(monkeypatch, votes):
-    scene, _ = render(HEAP, LOOK)
-    grid = shadow_hull(scene, labels_of(scene), votes=votes, nodes=32)
-    kernel = carve_kernels.carve
-    nothing = np.zeros((0, 0, 0), np.float32)
-    monkeypatch.setattr(
-        carve_kernels, "carve", lambda out, needed, denied, known, *rest: kernel(out, needed, denied, nothing, *rest)
-    )
-    whole = shadow_hull(scene, labels_of(scene), votes=votes, nodes=32)
-    np.testing.assert_array_equal(np.sign(grid.values), np.sign(whole.values))
-    near = whole.values.abs() < grid.spacing
-    assert torch.equal(grid.values[near], whole.values[near])

@@ -61,15 +61,6 @@ def test_rays_tell_the_rim_from_the_lid(seen, smeared):
     assert (belief[~truth.mask] == 0.5).all()  # no ray tells
 
 
-def test_every_second_pixel_tells_the_same(seen, smeared):
-    scene, truth, _, hull, labels, *_ = seen
-    behind, there, alike = smeared
-    part = (slice(None, None, 2), slice(None, None, 2))
-    belief = matter_of_hull(hull, scene, labels, behind[part], 2, alike[part])
-    right = (belief > 0.5) == there[part]
-    assert right[truth.mask[part]].mean() > 0.85
-
-
 def test_wrong_labels_are_outvoted(seen, smeared):
     scene, truth, _, hull, labels, *_ = seen
     behind, there, alike = smeared
@@ -77,13 +68,6 @@ def test_wrong_labels_are_outvoted(seen, smeared):
     noisy = replace(labels, visibility=torch.where(wrong, 1 - labels.visibility, labels.visibility))
     right = (matter_of_hull(hull, scene, noisy, behind, 1, alike) > 0.5) == there
     assert right[truth.mask].mean() > 0.85
-
-
-def test_an_unsure_label_is_not_asked(seen, smeared):
-    scene, _, _, hull, labels, *_ = seen
-    behind, _, alike = smeared
-    doubtful = replace(labels, confidence=torch.full_like(labels.confidence, 0.1))
-    assert (matter_of_hull(hull, scene, doubtful, behind, 1, 0 * alike) == 0.5).all()
 
 
 def test_the_integral_is_held_where_matter_is_and_breaks_beside_it(seen, smeared):

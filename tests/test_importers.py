@@ -117,15 +117,6 @@ def test_photos_of_this_layout_may_lie_in_a_folder_beside_the_lists(tmp_path, fo
     assert known.mask_path is not None
 
 
-@pytest.mark.parametrize("curve", ["sRGB", "linear8", "linear16"])
-def test_eight_bits_of_this_layout_are_read_as_their_shading_says(tmp_path, curve):
-    truth = seen_from_above((Sphere((0, 0, 40), 25),), side=48, n_lights=10)
-    write_diligent(tmp_path, truth, np.ones((10, 3)))
-    for i, rgb in enumerate(truth.stack.rgb):
-        write_photo(tmp_path / f"{i + 1:03d}.png", rgb * truth.mask[..., None], curve)
-    assert loaded(tmp_path).is_linear == (curve != "sRGB")
-
-
 def test_directions_in_columns_are_read_and_photos_go_by_number_without_a_list(tmp_path):
     truth = seen_from_above(side=32, n_lights=11)
     write_diligent(tmp_path, truth, np.ones((11, 3)))
@@ -161,41 +152,6 @@ def test_an_rti_folder_gives_directions_by_name_from_its_subfolders(tmp_path, de
     found = np.array([light.direction for light in known.calibration.lights])
     np.testing.assert_allclose(found, towards_lights(truth)[::-1], atol=2e-6)
     assert any("by name" in note for note in known.notes)
-
-
-@pytest.mark.slow  # 8 s
-def test_a_relief_that_fills_the_picture_is_found_by_shading(tmp_path):
-    truth = seen_from_above(STONE)
-    write_rti(tmp_path, truth)
-    scene = scene_of(tmp_path)
-    rise = truth.points[..., 2].max() - truth.points[..., 2].min()
-    where = np.ones_like(truth.mask)
-    assert height_error(scene, start_of(scene), truth, where) < 0.02 * rise
-
-
-@pytest.mark.slow
-def test_a_ball_on_a_ground_of_which_nothing_is_told_is_seen_in_colour():
-    """Normals integrated across its outline would be wrong by 25 degrees; its shadows tell of the break there."""
-    scene, truth = render((BALL,), Look(width=64, height=48, n_lights=12))
-    surface = start_of(replace(scene, ground_known=False))
-    found = surface_maps(surface, replace(scene.posed_camera, ground_height=-1e9)).normals.numpy()
-    cosine = (found * truth.normals).sum(-1)[truth.mask].clip(-1, 1)
-    assert np.degrees(np.arccos(cosine)).mean() < 8.0
-
-
-def test_names_that_fit_no_photo_go_by_order_and_say_so(tmp_path):
-    truth = seen_from_above(side=32, n_lights=6)
-    lines = write_rti(tmp_path, truth)
-    (tmp_path / "assembly-files" / "stone.lp").write_text("\n".join(lines).replace("stone", "rock"))
-    known = loaded(tmp_path)
-    assert any("by order, because the names in the list are not those of the photos" in note for note in known.notes)
-
-
-def test_a_list_that_fits_the_photos_in_part_is_explained(tmp_path):
-    lines = write_rti(tmp_path, seen_from_above(side=32, n_lights=6))
-    (tmp_path / "assembly-files" / "stone.lp").write_text("\n".join(lines).replace("stone_03", "stone_33"))
-    with pytest.raises(CalibrationError, match=r"6 lights and .*jpeg-exports holds 6 photos, of which 5 .* stone_33"):
-        loaded(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -331,14 +287,6 @@ def test_a_folder_of_two_layouts_is_called_so(tmp_path):
     write_rti(tmp_path, truth)
     with pytest.raises(CaptureError, match=r"DiLiGenT .* by light_directions.txt .* and RTI .* by assembly-files"):
         find_importer(tmp_path)
-
-
-def test_a_list_of_lights_beside_a_capture_of_ours_makes_no_other_layout_of_it(tmp_path):
-    write_rti(tmp_path, seen_from_above(side=32, n_lights=6))
-    (tmp_path / "session.toml").write_text("")
-    photos = tmp_path / "jpeg-exports"
-    (photos / "stone_07.png").write_bytes((photos / "stone_01.png").read_bytes())  # of the board: it has no light
-    assert find_importer(tmp_path) is None
 
 
 def test_a_list_that_is_named_for_the_lights_makes_no_other_layout_either(tmp_path):

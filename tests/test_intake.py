@@ -346,13 +346,6 @@ def test_an_archive_is_held_to_the_number_and_the_bytes_of_its_files(studio, mon
     assert "at most 3" in send(Parts(studio / "parts", studio), "m.zip", many).refused
 
 
-def test_a_role_that_the_sender_says_is_kept_in_a_flat_capture(studio):
-    parts = Parts(studio / "parts", studio)
-    send(parts, "a.jpg", jpeg(1))
-    send(parts, "b.jpg", jpeg(2), "board")
-    assert load_settings(studio / "vase").roles == (("board", ("b.jpg",)),)
-
-
 def test_settings_are_changed_one_by_one_and_a_wrong_one_leaves_the_file_as_it_was(studio):
     vase = studio / "vase"
     (vase / "session.toml").write_text('led_offset_mm = [1.5, 0, -2]\nscale = "120 mm"\n')

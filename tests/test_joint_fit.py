@@ -43,18 +43,3 @@ def test_noiseless_samples_give_back_normals_and_albedos(is_glossy):
     normals, found, cost = fit_normals(given, lobes, torch.full((PIXELS, PHOTOS), 0.002))
     assert angles(normals, true).quantile(0.95) < LIT * angles(given.normals, true).median()
     assert ((found - albedo) / albedo).abs().median() < 0.001 and cost.median() < 1e-3
-
-
-def test_shadowed_samples_are_outliers():
-    given, lobes, true, _ = samples(True)
-    given.value[torch.rand(PIXELS, PHOTOS) < 0.1] *= 0.1
-    normals, _, _ = fit_normals(given, lobes, torch.full((PIXELS, PHOTOS), 0.002))
-    assert angles(normals, true).median() < LIT * angles(given.normals, true).median()
-    assert angles(normals, true).quantile(0.9) < SHADOWED * angles(given.normals, true).median()
-
-
-def test_unusable_samples_do_not_count():
-    given, lobes, true, _ = samples(True)
-    given.value[:, :4], given.weight[:, :4] = 5.0, 0.0
-    normals, _, _ = fit_normals(given, lobes, torch.full((PIXELS, PHOTOS), 0.002))
-    assert angles(normals, true).quantile(0.9) < LIT * angles(given.normals, true).median()

@@ -88,20 +88,6 @@ def test_the_shading_tells_point_lights_from_directional_ones(tmp_path, kind):
     assert {light.kind for light in load_known_scene(tmp_path).calibration.lights} == {kind}
 
 
-@pytest.mark.parametrize(("shapes", "near"), [((), 0.02), ((BALL,), 0.35)])
-def test_the_power_of_the_lights_makes_the_brightest_albedo_nine_tenths(tmp_path, shapes, near):
-    truth = write_scene(tmp_path, light_type="point", shapes=shapes)
-    power = load_known_scene(tmp_path).calibration.lights[0].power
-    expected = truth.calibration.lights[0].power * 0.6 / 0.9  # the ground's albedo is 0.6
-    assert np.allclose(power, expected, rtol=near)  # the ball, of albedo 0.6 too, is up to 40 % nearer in 1 / d^2
-
-
-def test_two_valued_grey_pictures_are_shadows_and_no_colour(tmp_path):
-    write_scene(tmp_path, light_type="point", shadow_only=True)
-    known = load_known_scene(tmp_path)
-    assert known.rgb_paths is None and len(known.shadow_paths or ()) == 6
-
-
 @pytest.mark.parametrize(
     ("wanted", "colour", "shadow"), [("auto", 1, 0), ("rgb", 1, 0), ("shadow", 0, 1), ("both", 1, 1)]
 )
@@ -169,7 +155,3 @@ def test_a_split_that_is_not_there_names_those_that_are(tmp_path):
     write_scene(tmp_path)
     with pytest.raises(CalibrationError, match=r"transforms_test.json does not exist.*transforms_train.json"):
         load_known_scene(tmp_path, "test")
-
-
-def test_a_folder_of_plain_photos_is_not_a_known_scene(tmp_path):
-    assert ShadowNeus().recognises(tmp_path) is None

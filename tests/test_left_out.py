@@ -23,7 +23,6 @@ from capture.checks.first_look import FirstLook
 from capture.errors import CaptureError
 from capture.session.seen import SeenPhotos
 from capture.session.session import load_session
-from capture.session.sorting import ROLE_FOLDERS
 from shadowgraph.run_command import _print_result
 
 LIT = [f"IMG_{101 + k}.jpg" for k in range(6)]
@@ -75,16 +74,6 @@ def test_a_photo_that_cannot_be_read_is_left_out_by_name(tmp_path, how, is_sorte
     assert [path.name for path in load_session(folder).lit] == [*LIT[:2], *LIT[3:]]
 
 
-@pytest.mark.parametrize("role", ["board", "light", "dark", "side"])
-@pytest.mark.parametrize("how", ["truncated", "empty", "text"])
-def test_so_is_one_of_every_other_role(tmp_path, role, how):
-    folder = save_capture(tmp_path)
-    photo = lit_table.photograph(lit_table.table(np.random.default_rng(8)) * 0.3, np.random.default_rng(9))
-    BREAKS[how](save_photo(folder / ROLE_FOLDERS[role] / "IMG_0.jpg", photo))
-    assert left_out(folder) == {"IMG_0.jpg": ("unreadable", role)}
-    assert [path.name for path in load_session(folder).board] == ["IMG_1.jpg"]
-
-
 def again(path: Path, side: float = 1.0, kind: str = "jpg", **how) -> None:
     with Image.open(path) as picture:
         size = (round(side * picture.width), round(side * picture.height))
@@ -113,12 +102,6 @@ def test_a_copy_is_left_out_and_its_original_stays(tmp_path, how, is_sorted):
     assert found.kind == "copy" and found.photo.name.startswith("again") and LIT[3] in found.text
     looks = {one.name.split("/")[-1]: one for one in FirstLook(folder).look()}
     assert looks[found.photo.name].drop and looks[found.photo.name].remarks[0][0] == "copy"
-
-
-def test_a_photo_that_is_in_two_folders_counts_once(tmp_path):
-    folder = save_capture(tmp_path)
-    shutil.copy(folder / "board" / "IMG_1.jpg", folder / "photos" / "IMG_1.jpg")
-    assert left_out(folder) == {"IMG_1.jpg": ("copy", "lit")}
 
 
 def test_photos_that_are_alike_by_their_purpose_are_no_copies(tmp_path):
@@ -150,13 +133,6 @@ def test_a_photo_of_another_size_is_left_out(tmp_path, how, role):
     path = save_photo(folder / role / "IMG_150.jpg", fresh)
     SIZES[how](Image.open(path)).save(path, quality=95)
     assert left_out(folder) == {"IMG_150.jpg": ("another size", "lit" if role == "photos" else "dark")}
-
-
-def test_of_two_photos_of_the_board_the_one_of_the_others_size_is_the_tripods(tmp_path):
-    folder = save_capture(tmp_path)
-    with Image.open(folder / "board" / "IMG_1.jpg") as picture:
-        picture.crop((1, 1, 319, 239)).resize((640, 480)).save(folder / "board" / "IMG_0.jpg", quality=95)
-    assert load_session(folder).board[0].name == "IMG_1.jpg"
 
 
 @pytest.mark.parametrize("is_sorted", [True, False])
@@ -218,15 +194,6 @@ def test_a_zoomed_photo_of_the_board_does_not_spoil_the_tripods(tmp_path, window
     (folder / "session.toml").write_text(f'board = "{BOARDS[0]}"\nroles = {{ board = ["board/IMG_1.png"] }}\n')
     found = fit_board(load_session(folder))
     assert found.posed_camera.centre == pytest.approx([60, -420, 380], abs=12)
-
-
-def test_a_phone_that_carries_the_light_is_still_told_from_the_board(tmp_path):
-    folder, rng = save_capture(tmp_path, is_sorted=False), np.random.default_rng(2)
-    for k in range(5):
-        turned = lit_table.with_board(lit_table.table(rng), CLOSE * 0.4 + 30 * k) * lit_table.flashlight(k)
-        save_photo(folder / f"PXL_{k}.jpg", lit_table.photograph(turned, rng), model="Carries", second=10 + k)
-    session = load_session(folder, seen=SeenPhotos(lambda path: path.name.startswith("PXL")))
-    assert len(session.light) == 5 and len(session.lit) == len(LIT)
 
 
 # --- a whole command -------------------------------------------------------------------------------------------------

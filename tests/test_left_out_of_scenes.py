@@ -13,7 +13,6 @@ from dataset_folders import (
     write_photo,
     write_rti,
     write_s3nerf,
-    write_shadowneus_real,
 )
 from PIL import Image
 from scipy.io import savemat
@@ -21,8 +20,6 @@ from synthetic import BALL, Look, render
 from test_known import write_scene
 
 import shadowgraph
-from calibration.lights.files import read_lights
-from calibration.scenes.distant_camera import distant_camera
 from calibration.scenes.importers import import_folder
 from capture.errors import CaptureError, UserError
 from reconstruct.check.verdict import read_and_check
@@ -123,11 +120,6 @@ def s3nerf(folder, truth):
     return folder / "rgb"
 
 
-def shadowneus_real(folder, truth):
-    write_shadowneus_real(folder, truth)
-    return folder / "image"
-
-
 def shadowneus(folder, _):
     write_scene(folder, Look(width=SIDE, height=SIDE, n_lights=PHOTOS))
     return folder / "train"
@@ -142,28 +134,6 @@ def deepshadow(folder, truth):
     (folder / "params.json").write_text(json.dumps(given))
     (folder / "all_object_lights.txt").write_text("\n".join(lines))
     return folder / "0"
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("layout", [ours, s3nerf, shadowneus_real, shadowneus])
-def test_lights_with_a_camera_stay_with_their_photos(tmp_path, truth, layout, fault):
-    if layout is not ours:
-        truth = render((BALL,), Look(width=SIDE, height=SIDE, n_lights=PHOTOS), from_above(SIDE))[1]
-    paths = photos_of(layout(tmp_path / "scene", truth))
-    whole = open_source(tmp_path / "scene", RunOptions()).known
-    FAULTS[fault][0](paths[0])
-    source = open_source(tmp_path / "scene", RunOptions())
-    assert whole is not None and source.known is not None
-    assert [(one.photo, one.kind) for one in source.left_out()] == [(paths[0], FAULTS[fault][1])]
-    before, after = (
-        {light.photo: light.homogeneous() for light in scene.calibration.lights} for scene in (whole, source.known)
-    )
-    assert list(after) == [path.name for path in paths[1:]]
-    turns = [np.array(list(after.values()))[:, :3], np.array([before[name] for name in after])[:, :3]]
-    apart = [np.linalg.norm(one[:, None] - one[None], axis=-1) for one in turns]  # another frame keeps distances
-    assert apart[0] == pytest.approx(apart[1], rel=0.05, abs=1e-3)
-    stack = read_photos(source, RunOptions())[0].stack
-    assert stack is not None and list(stack.paths) == paths[1:]
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -214,17 +184,6 @@ def test_a_list_with_fewer_rows_than_photos_says_both_counts_and_the_remedy(tmp_
         np.savetxt(given, rows, fmt="%.6f", delimiter="," if given.suffix == ".csv" else " ")
     with pytest.raises(UserError, match=rf"{name} lists 6 lights for 8 photos.*Name the photos in the file"):
         open_source(scene, RunOptions(lights=str(given)) if is_named else RunOptions())
-
-
-def test_a_list_by_order_of_a_capture_counts_all_photos(tmp_path, truth):
-    given = tmp_path / "given.csv"
-    np.savetxt(given, towards_lights(truth), fmt="%.6f", delimiter=",")
-    every = [f"{letter}.jpg" for letter in "abcdefgh"]
-    for gone in (0, 3, 7):
-        left = [name for name in every if name != every[gone]]
-        lights = read_lights(given, left, distant_camera(SIDE, SIDE), every).lights
-        wanted = np.delete(towards_lights(truth), gone, axis=0)
-        assert np.abs(np.array([light.direction for light in lights]) - wanted).max() < 1e-3
 
 
 def test_an_import_names_what_it_left_out_and_a_command_says_it(tmp_path, truth, capsys):

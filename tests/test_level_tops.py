@@ -48,37 +48,6 @@ def test_textured_ground_stays_ground_around_and_between_objects():
     assert (found.mask_confidence.numpy() > 0)[bare].mean() > 0.995
 
 
-def test_light_thrown_on_the_ground_by_a_vertical_face_is_no_object():
-    scene, truth = render((Box((-40.0, -30.0, 0.0), (40.0, 30.0, 90.0)),), NOISY)
-    points = ground_points(scene)
-    face, inward = torch.tensor([0.0, -30.0, 45.0]), torch.tensor([0.0, 1.0, 0.0])
-    towards, strength = irradiance(scene, face[None])
-    on_face = (strength[:, 0] * (towards @ -inward)).clamp(min=0)  # of each light, on the front face
-    near = torch.exp((points[..., 1] + 30) / 20) * (points[..., 1] < -30) * (points[..., 0].abs() < 40)
-    bounced = 0.15 * on_face[:, None, None, :] * near[None, :, :, None] * torch.tensor(~truth.mask)[None, :, :, None]
-    assert scene.rgb is not None
-    found = ground_module.test_ground(replace(scene, rgb=scene.rgb + 0.6 * bounced))
-    assert iou(found, truth) > 0.96
-
-
-@pytest.mark.slow  # 28 s: most of it renders 448 balls
-def test_level_parts_that_only_a_ridge_divides_are_object():
-    rows = [Sphere((x, y, 7.0), 2.5) for x in (-39.0, -13.0, 13.0, 39.0) for y in range(-30, 31, 2)]
-    ends = [Sphere((float(x), y, 7.0), 2.5) for y in (-29.0, -10.0, 10.0, 29.0) for x in range(-40, 41, 2)]
-    scene, truth = render((slab(7.0), *rows, *ends), NOISY)
-    found = ground_module.test_ground(scene)
-    assert shares(found, truth)[0] > 0.97 and iou(found, truth) > 0.96
-
-
-def test_ground_that_the_object_encloses_stays_ground():
-    lengths = [Box((-40, y, 0), (40, y + 8, 20)) for y in (-40, 32)]
-    widths = [Box((x, -40, 0), (x + 8, 40, 20)) for x in (-40, 32)]
-    scene, truth = render((*lengths, *widths), NOISY)
-    found = ground_module.test_ground(scene)
-    court = ~truth.mask & (np.abs(truth.points[..., :2]) < 30).all(-1)
-    assert ((found.mask < 0.5) & (found.mask_confidence > 0)).numpy()[court].mean() > 0.97
-
-
 @pytest.mark.parametrize("kind", ["point", "directional"])
 def test_a_sheet_of_another_colour_under_the_object_is_ground(kind):
     ball, sheet = Sphere((0.0, 0.0, 32.0), 30.0), Box((-50.0, -45.0, 0.0), (50.0, 45.0, 0.1), (0.8, 0.6, 0.3))

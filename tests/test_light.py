@@ -15,17 +15,6 @@ def test_irradiance_falls_with_the_square_of_the_distance():
     np.testing.assert_allclose(far, [[3e-4, 2e-4, 1e-4]], rtol=1e-12)
 
 
-def test_irradiance_follows_the_cosine_and_is_zero_from_behind():
-    light = Light("a", "directional", direction=np.array([0.0, 0.6, 0.8]))
-    assert irradiance(np.zeros((1, 3)), UP, light)[0, 0] == pytest.approx(0.8)
-    assert irradiance(np.zeros((1, 3)), -UP, light)[0, 0] == 0
-
-
-def test_without_normals_the_surface_faces_the_light():
-    light = Light("a", "point", position=np.array([30.0, 0.0, 40.0]))
-    assert irradiance(np.zeros((1, 3)), None, light)[0, 0] == pytest.approx(1 / 2500)
-
-
 def test_the_beam_is_brightest_along_its_axis():
     position, axis = np.array([0.0, 0.0, 100.0]), np.array([0.0, 0.6, -0.8])
     light = Light("a", "point", position=position, axis=axis)

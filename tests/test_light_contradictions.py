@@ -11,7 +11,6 @@ from synthetic import BALL, HEAP, Look, render
 
 from reconstruct.fields import Fields
 from reconstruct.hull.shadow_hull import carved
-from reconstruct.initialization import light_contradictions
 from reconstruct.initialization.light_contradictions import contradictions
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.run.report_json import misfit, pieces
@@ -54,19 +53,6 @@ def test_a_light_that_is_off_by_seven_degrees_is_named(about):
     found = contradictions(replace(scene, lights=lights), assemble_labels(scene, None, None))
     assert found.contradicting() == [3]
     assert scene.photo_names[3] in found.sentences()[0] and "--light-error" in found.sentences()[0]
-
-
-def test_asking_a_few_heights_first_finds_the_same(monkeypatch):
-    scene, _ = render((BALL,), LOOK)
-    lights = scene.lights.clone()
-    lights[3, :2] = scene.lights[3, :2] + 0.1 * scene.lights[3, 2]
-    scene = replace(scene, lights=lights)
-    found = contradictions(scene, assemble_labels(scene, None, None))
-    monkeypatch.setattr(light_contradictions, "FEW_FIRST", 1)  # all of them first
-    at_once = contradictions(scene, assemble_labels(scene, None, None))
-    assert np.nanmax(found.unexplained) > 0
-    np.testing.assert_array_equal(found.unexplained, at_once.unexplained)
-    np.testing.assert_array_equal(found.resolved, at_once.resolved)
 
 
 def test_a_surface_that_misses_held_out_shadows_says_so():

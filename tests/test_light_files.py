@@ -11,7 +11,7 @@ import scipy.io
 from flashlight_photos import CAMERA, POSED_CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights, photograph
 
 from calibration.calibrate_with_file import with_opinions
-from calibration.calibration import Calibration, save_calibration
+from calibration.calibration import Calibration
 from calibration.lights.files import read_lights, read_opinions
 from calibration.lights.layouts import BLENDER
 from calibration.lights.power import SHADING_MISFIT, with_power_per_photo
@@ -48,14 +48,6 @@ def their_camera(flip: bool) -> np.ndarray:
     return pose.matrix() @ np.diag([1.0, -1, -1, 1] if flip else np.ones(4))
 
 
-def test_files_may_begin_with_the_mark_that_windows_editors_write(tmp_path):
-    rows = [{"photo": light.photo, "position": np.array(light.position).tolist()} for light in LIGHTS]
-    (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}), encoding="utf-8-sig")
-    np.testing.assert_allclose(places(read_lights(tmp_path / "lights.json", PHOTOS, POSED_CAMERA)), PLACES)
-    np.savetxt(tmp_path / "lights.txt", directions(), header="4", comments="", encoding="utf-8-sig")
-    assert_towards_the_lights(read_lights(tmp_path / "lights.txt", PHOTOS, POSED_CAMERA))
-
-
 @pytest.mark.parametrize("decimal", [".", ","])
 def test_an_lp_file_gives_directions_by_name_in_any_order(tmp_path, decimal):
     file = tmp_path / "dome.lp"
@@ -63,14 +55,6 @@ def test_an_lp_file_gives_directions_by_name_in_any_order(tmp_path, decimal):
     rows = [row.replace(".jpg", "_jpg").replace(".", decimal).replace("_jpg", ".jpg") for row in rows]
     file.write_text("\n".join([str(len(rows)), *reversed(rows)]))
     assert_towards_the_lights(read_lights(file, PHOTOS, POSED_CAMERA))
-
-
-def test_a_list_without_names_goes_by_order_and_says_so(tmp_path):
-    file = tmp_path / "light_directions.txt"
-    np.savetxt(file, directions())
-    given = read_lights(file, PHOTOS, POSED_CAMERA)
-    assert_towards_the_lights(given)
-    assert any("by order" in note for note in given.notes)
 
 
 def test_a_dome_gives_places_whatever_its_unit(tmp_path):
@@ -87,17 +71,6 @@ def test_shadowneus_real_photos_are_placed_by_their_camera_and_floor(tmp_path):
     file = tmp_path / "params.npz"
     np.savez(file, light_pose=poses, camera_pose=their_camera(False), floor_height=ELSEWHERE.translation[2])
     np.testing.assert_allclose(places(read_lights(file, PHOTOS, POSED_CAMERA)), PLACES, atol=1e-6)
-
-
-def test_s3nerf_looks_along_minus_z_and_numbers_its_photos(tmp_path):
-    file = tmp_path / "params.json"
-    lights = np.zeros((9, 3))
-    lights[[1, 3, 4, 8]] = ELSEWHERE.apply(PLACES)
-    pose = (ELSEWHERE @ WORLD_FROM_CAMERA).matrix() @ np.diag([1.0, -1, -1, 1])
-    file.write_text(json.dumps({"light_pos": lights.tolist(), "pose_c2w": pose.tolist()}))
-    photos = ["ld_002.png", "ld_004.png", "ld_005.png", "ld_009.png"]
-    given = read_lights(file, photos, POSED_CAMERA)
-    np.testing.assert_allclose(np.array([x.position for x in given.lights]), PLACES, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["point", "directional"])
@@ -122,14 +95,6 @@ def test_shadowneus_scenes_are_placed_by_their_camera(tmp_path, kind):
         assert_towards_the_lights(given)
     else:
         np.testing.assert_allclose(places(given), PLACES, atol=1e-6)
-
-
-def test_our_own_calibration_comes_back_with_beam_and_power(tmp_path):
-    file = tmp_path / "calibration.json"
-    save_calibration(Calibration(CAMERA, WORLD_FROM_CAMERA, 0.0, LIGHTS, beam=(2.0, 0.1)), file)
-    given = read_lights(file, PHOTOS[1:], POSED_CAMERA)
-    assert given.has_power and given.beam == (2.0, 0.1)
-    np.testing.assert_array_equal(given.lights[0].axis, LIGHTS[1].axis)
 
 
 def test_a_plain_list_may_give_several_lights_to_a_photo(tmp_path):

@@ -10,17 +10,14 @@ from test_known import write_scene
 from test_solver import depth_error
 
 from capture.errors import CaptureError
-from reconstruct import fields
 from reconstruct.config import FitConfig, Level
-from reconstruct.fields import load_fields, save_fields
 from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet
-from reconstruct.solve import solver
 from reconstruct.solve.level import LevelFit
-from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift, unseen_motion
+from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift
 from reconstruct.solve.ray_operators import cross_entropy
 from reconstruct.solve.solver import fit
 from reconstruct.solve.trials import judge, try_lights
@@ -30,7 +27,6 @@ from reconstruct.source.photos import read_photos
 from reconstruct.source.source import open_source
 from reconstruct.torch_sdf.compiled import CompiledRays
 
-SMALL = FitConfig(levels=(Level(24, 30, (0.5, 0.4), 3, 5e-4), Level(40, 30, (0.4, 0.1), 2)), votes=1)
 RICH = FitConfig(levels=(Level(32, 40, (0.5, 0.4), 3, 5e-4), Level(48, 30, (0.4, 0.1), 2)), votes=1)
 TRIED_TWICE = replace(RICH, levels=(RICH.levels[0], Level(40, 30, (0.4, 0.2), 2), RICH.levels[1]))
 SHARPNESS = 2.0
@@ -89,21 +85,6 @@ def test_the_light_gradient_is_the_derivative_of_the_loss(light):
             assert abs(left[:3] @ axis - slope) < 0.02 * left[3], (label, left[:3] @ axis, slope)
 
 
-def test_a_homology_about_the_eye_keeps_what_is_in_line():
-    scene, _ = render((BALL,), Look(n_lights=6))
-    scene = replace(scene, light_sigma=torch.ones(6, 3))
-    eye, lights = scene.eye.double().numpy(), scene.lights.double().numpy()[:, :3]
-    small = 1e-9  # moves the lights by some 1e-4 mm
-    moved = lights + small * unseen_motion(scene)
-    for light, light_moved in zip(lights, moved, strict=True):
-        foot = np.array([30.0, -20.0, 0.0])
-        blocker = foot + 0.2 * (light - foot)
-        blocker_moved = blocker + small * blocker[2] * (eye - blocker)
-        away = np.cross(blocker_moved - foot, light_moved - foot)
-        alone = np.cross(blocker - foot, light_moved - foot)
-        assert np.linalg.norm(away) < 1e-3 * np.linalg.norm(alone)  # of second order
-
-
 def test_a_known_light_never_moves_and_an_uncertain_one_only_against_its_gradient():
     scene, _ = render((BALL,), Look(n_lights=16))
     sigma = torch.full((16, 3), 5.0)
@@ -121,14 +102,6 @@ def test_a_known_light_never_moves_and_an_uncertain_one_only_against_its_gradien
     assert shift[2, 0] < 0 and shift[3, 0] < 0 and shift[3, 2] < 0
     assert np.abs(shift.mean(0)).max() < 0.1 * np.abs(shift).max()  # all together they stay
     assert np.linalg.norm(lights.shift.shift, axis=1).max() <= 3.0 + 1e-9
-
-
-def test_a_direction_stays_a_unit_vector():
-    scene, _ = render((BALL,), Look(n_lights=4, kind="directional"))
-    scene = replace(scene, light_sigma=torch.full((4, 3), 0.02))
-    turned = lit_from(scene, LightShift(np.ones((4, 3)), np.zeros((4, 3))))
-    torch.testing.assert_close(turned.lights.norm(dim=1), torch.ones(4))
-    assert (turned.lights != scene.lights).any(1).all()
 
 
 def heap(kind: str = "point"):
@@ -153,26 +126,6 @@ def test_lights_off_by_three_per_cent_come_back_and_the_shape_hardly_suffers():
     assert depth_error(fields, scene, truth) < 0.9 * depth_error(held, scene, truth)
     assert held.light_trial is None
     torch.testing.assert_close(held.lights, given.lights, rtol=0, atol=0)
-
-
-@pytest.mark.slow  # 7 s: as point lights do
-def test_directions_follow_their_shadows_too(monkeypatch):
-    monkeypatch.setattr(fields, "SIGMAS", -100.0)  # accepted in any case: this is about where they move
-    scene, _ = heap("directional")
-    given = misplaced(scene, 0.03)
-    assert off(fit(given, RICH, silent).lights, scene.lights) < 0.7 * off(given.lights, scene.lights)
-
-
-@pytest.mark.slow  # 20 s: three solves; the trial alone is tested below
-def test_perfect_lights_that_were_called_uncertain_stay_where_they_are():
-    scene, truth = heap()
-    uncertain = replace(scene, light_sigma=misplaced(scene, 0.03).light_sigma)
-    fields = fit(uncertain, RICH, silent)
-    assert fields.light_trial is not None and not fields.light_trial.is_accepted
-    torch.testing.assert_close(fields.lights, scene.lights, rtol=0, atol=0)
-    # seeds alone make 0.60, 0.67 and 0.82 mm of it: one held solve is no measure
-    held = [depth_error(fit(scene, replace(RICH, seed=seed), silent), scene, truth) for seed in (0, 1)]
-    assert depth_error(fields, scene, truth) < 1.3 * np.mean(held)
 
 
 def true_surface(truth, spacing: float = 3.0) -> SdfGrid:
@@ -216,29 +169,6 @@ def test_what_chance_may_do_is_not_accepted():
     assert judge(held_out, before, before - 0.02 + 0.01 * by_photo, 10).is_accepted
     alone = replace(held_out, photo=np.zeros(500, int))
     assert not judge(alone, before, before - 0.05, 10).is_accepted  # of one photo nobody knows the noise
-
-
-@pytest.mark.slow  # 18 s; test_crash.py resumes moving lights, too
-def test_a_stopped_solve_with_moving_lights_ends_in_the_very_same_bits(tmp_path, monkeypatch):
-    monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
-    scene, _ = render((BALL,), Look(width=84, height=63, n_lights=12))
-    scene = misplaced(scene, 0.02)
-    straight = fit(scene, SMALL, silent)
-
-    def stop(*, stage, done, total, message, numbers, surface):
-        if stage == "solve" and done == 47:
-            raise KeyboardInterrupt
-
-    file = tmp_path / "checkpoint.safetensors"
-    with pytest.raises(KeyboardInterrupt):
-        fit(scene, SMALL, stop, file)
-    resumed = fit(scene, SMALL, silent, file)
-    torch.testing.assert_close(resumed.grid.values, straight.grid.values, rtol=0, atol=0)
-    torch.testing.assert_close(resumed.lights, straight.lights, rtol=0, atol=0)
-    assert resumed.light_trial == straight.light_trial is not None
-    save_fields(straight, tmp_path / "fields.safetensors")
-    assert load_fields(tmp_path / "fields.safetensors").light_trial == straight.light_trial
-    torch.testing.assert_close(load_fields(tmp_path / "fields.safetensors").lights, straight.lights)
 
 
 def test_a_stated_light_error_makes_known_lights_uncertain(tmp_path):

@@ -40,12 +40,6 @@ def angles(a: torch.Tensor, b: torch.Tensor) -> np.ndarray:
     return np.degrees(np.arccos((a * b).sum(-1).clamp(-1, 1).numpy()))
 
 
-def test_a_pixel_that_every_light_reaches_faces_up():
-    true, towards = torch.tensor([[0.0, 0, 1]]), lights(40)
-    normal, confidence = read(true, towards, torch.ones(40, 1), torch.ones(40, 1))
-    assert angles(normal, true)[0] < 4 and confidence[0] > 0.5
-
-
 @pytest.mark.parametrize(("count", "error"), [(20, 10), (40, 7)])
 def test_normals_of_a_ball_without_cast_shadows(count, error):
     true, towards = seen_normals(300), lights(count)
@@ -65,12 +59,6 @@ def test_a_cast_shadow_behind_known_matter_turns_no_normal():
     assert angles(kept, true)[0] < 16 < 24 < angles(turned, true)[0]
 
 
-def test_few_lights_on_one_side_leave_the_normal_open():
-    towards = lights(4, 40, 50)
-    _, confidence = read(torch.tensor([[0.0, 0, 1]]), towards, torch.ones(4, 1), torch.ones(4, 1))
-    assert confidence[0] < 0.1
-
-
 def shadow_start(shape, name: str = HULL) -> tuple[HullStart, tuple]:
     """The start of a solve from exact shadow pictures with a mask, and its scene."""
     scene, _ = render((shape,), Look(n_lights=24, with_shadow=True, with_mask=True))
@@ -87,13 +75,3 @@ def test_a_resumed_solve_reads_normals_exactly_if_the_first_one_did(shape):
     (again,) = shadow_start(shape, first.name)[0].labels(surface, scenes)
     assert torch.equal(labels.normals, again.normals)
     assert torch.equal(labels.normal_confidence, again.normal_confidence)
-
-
-def test_with_normals_a_flat_top_faces_up():
-    _, scenes = shadow_start(Box((-50, -40, 0), (50, 40, 20)))
-    start = shadow_start(Box((-50, -40, 0), (50, 40, 20)))[0]
-    surface, observer = start.surface(), Observer(scenes[0])
-    labels = observer.with_normals(observer.labels(surface, scenes[0]), surface, scenes[0])
-    top = (labels.normal_confidence > 0) & (labels.visibility.mean(0) > 0.95)
-    assert top.sum() > 100
-    assert np.degrees(np.arccos(labels.normals[top][:, 2].clamp(-1, 1).numpy())).mean() < 8

@@ -3,10 +3,9 @@
 import json
 import resource
 import sys
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
 import psutil
 import pytest
 from PIL import Image
@@ -21,7 +20,7 @@ from reconstruct.run import report_json as summary
 from reconstruct.run_folder import cost
 from reconstruct.run_folder.cost import give_memory_back, memory_room, share_memory_among_threads
 from reconstruct.run_folder.folder import PLAN, RunFolder
-from reconstruct.source.memory import MARGIN, OVERRIDE, keep_spread, plan_for, predicted_memory, read_plan
+from reconstruct.source.memory import MARGIN, OVERRIDE, plan_for, predicted_memory, read_plan
 from reconstruct.source.options import RunOptions
 from reconstruct.source.source import Source
 
@@ -39,17 +38,6 @@ MEASURED = [
 def test_the_prediction_is_within_a_fifth_of_what_was_measured(run):
     *what, measured = run
     assert predicted_memory(*what) == pytest.approx(measured, rel=0.2)
-
-
-def test_more_photos_and_finer_presets_need_more():
-    assert predicted_memory(300, 4032, 3024, "draft") < predicted_memory(300, 4032, 3024, "standard")
-    assert predicted_memory(200, 4032, 3024, "standard") > predicted_memory(90, 4032, 3024, "standard")
-
-
-def test_with_room_for_everything_nothing_is_reduced():
-    plan = plan_for(36, 1008, 756, "draft", 6e9)
-    assert (plan.photos, plan.long_side) == (36, 320)
-    assert plan.sentence.endswith("6.00 GB are free") and plan.predicted == predicted_memory(36, 1008, 756, "draft")
 
 
 def test_photos_go_first_then_pixels_then_photos_again_and_the_sentence_says_so():
@@ -76,21 +64,6 @@ def test_a_plan_is_read_as_it_was_written_and_what_is_none_is_not(tmp_path):
     for content in ("", "[]", '{"photos": 3}', json.dumps(asdict(plan) | {"photos": -1}), "[" * 99999):
         (tmp_path / "memory.json").write_text(content)
         assert read_plan(tmp_path / "memory.json") is None
-
-
-def test_the_photos_that_stay_have_lights_all_around():
-    truth = render((BALL,), Look(n_lights=60, width=24, height=18))[1].calibration
-    crowded = [light for light in truth.lights[:5] for _ in range(20)]
-    lights = [replace(light, photo=f"{i}.jpg") for i, light in enumerate([*crowded, *truth.lights])]
-    lights[7] = replace(lights[7], used=False, reason="blurred")
-    thinned = keep_spread(replace(truth, lights=tuple(lights)), 12)
-    used = [light for light in thinned.lights if light.used]
-    assert len(used) == 12 and thinned.lights[7].reason == "blurred"
-    places = np.array([light.position for light in used])
-    apart = np.linalg.norm(places[:, None] - places[None], axis=-1) + 1e9 * np.eye(12)
-    assert apart.min() > 200  # mm: of 12 lights on a half sphere of 500 mm; in each crowd it is 0
-    again = keep_spread(thinned, 1000)
-    assert sum(light.used for light in again.lights) == len(lights) - 1
 
 
 def test_a_run_may_hold_what_is_free_and_no_more_than_its_limits(tmp_path, monkeypatch):

@@ -2,7 +2,6 @@
 
 import json
 import struct
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -71,22 +70,6 @@ def test_the_ground_cuts_the_object_flat_and_closes_it():
     assert (mesh.vertex_normals[mesh.vertices[:, 2] < 1e-6][:, 2] < 0).all()
 
 
-def test_a_cut_between_nodes_is_where_the_ball_crosses_the_ground_and_its_inside_faces_down():
-    height = 8.3  # nodes lie 0.3 of a voxel above the ground; the ball widens by 1.5 voxels per voxel there
-    mesh = extract_mesh(solved(sphere_grid(height)))
-    on_ground = mesh.vertices[:, 2] < 1e-6
-    away = np.linalg.norm(mesh.vertices[on_ground, :2], axis=1)
-    assert away.max() == pytest.approx(np.sqrt(RADIUS**2 - height**2), abs=0.1)
-    inner = mesh.vertex_normals[on_ground][away < 3]
-    np.testing.assert_allclose(inner, np.tile([0.0, 0.0, -1.0], (len(inner), 1)), atol=1e-6)
-
-
-def test_a_ground_that_passes_through_nodes_leaves_no_flat_triangles():
-    mesh = extract_mesh(solved(sphere_grid(height=0.0)))
-    assert mesh.is_watertight and (mesh.area_faces > 0).all()
-    assert mesh.volume == pytest.approx(2 / 3 * np.pi * RADIUS**3, rel=0.01)
-
-
 def test_an_object_that_leaves_the_box_is_closed_at_its_walls():
     grid = sphere_grid(height=20)
     cut = SdfGrid(grid.values[8:], grid.origin + torch.tensor([8.0, 0, 0]), 1.0)
@@ -140,14 +123,6 @@ def test_too_fine_a_grid_is_refused_with_its_numbers():
         extract_mesh(solved(sphere_grid(height=20)), max_nodes=1000)
 
 
-def test_a_preview_is_coarser_and_closed():
-    grid = sphere_grid(height=20, spacing=0.5)
-    preview = preview_mesh(grid, 0.0, max_nodes=20**3)
-    assert preview is not None and preview.is_watertight
-    assert len(preview.faces) < 0.2 * len(extract_mesh(solved(grid)).faces)
-    assert preview.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.1)
-
-
 def test_a_preview_has_the_colours_of_the_photos_and_behind_those_of_the_nearest_that_are_seen():
     preview, fields = preview_mesh(sphere_grid(height=20), 0.0), solved(sphere_grid(height=20))
     photos = torch.zeros(4, 60, 60, 3)
@@ -160,35 +135,12 @@ def test_a_preview_has_the_colours_of_the_photos_and_behind_those_of_the_nearest
     assert ((found[:, 0] - found[:, 2] > 200) == (x < 0))[aside].all()
 
 
-def test_the_far_side_of_a_preview_has_the_colour_of_the_rim_and_not_that_of_the_pixels_before_it():
-    preview, fields = preview_mesh(sphere_grid(height=20), 0.0), solved(sphere_grid(height=20))
-    camera, middle = fields.posed_camera, np.array([0.0, 0.0, 20.0])
-    assert preview is not None
-    towards = (camera.centre - middle) / np.linalg.norm(camera.centre - middle)
-    pixel = camera.project_with_depth(np.concatenate([middle[None], preview.vertices]))[0]
-    away = np.linalg.norm(np.stack(np.meshgrid(np.arange(60), np.arange(60)), -1) - pixel[0], axis=-1)
-    photo = torch.zeros(1, 60, 60, 3)
-    photo[0, ..., 0] = torch.from_numpy(away < 0.6 * np.linalg.norm(pixel[1:] - pixel[0], axis=1).max())  # red
-    photo[0, ..., 1] = 1 - photo[0, ..., 0]  # a green rim
-    found = vertex_colours(PhotoColours(camera, photo).coloured(preview)).astype(int)
-    behind = (preview.vertices - middle) @ towards < -0.3 * RADIUS
-    assert behind.sum() > 50 and (found[:, 1] > found[:, 0])[behind].all()
-
-
 def test_a_sheet_between_the_nodes_of_a_preview_has_none():
     place = torch.arange(40.0)
     sheet = ((place - 21).abs() - 0.8)[:, None, None].expand(40, 40, 40).contiguous()
     grid = SdfGrid(torch.maximum(sheet, ((place - 20).abs() - 15)[None, :, None]), torch.zeros(3), 1.0)
     assert len(extract_mesh(solved(grid)).faces) > 1000
     assert preview_mesh(grid, 0.0, max_nodes=20**3) is None
-
-
-def test_the_side_that_no_photo_shows_has_the_colour_of_the_nearest_that_one_does():
-    fields = solved(sphere_grid(height=20))
-    albedo = fields.albedo.clone()
-    albedo[:, :5] = 0.9  # ground, far from the object
-    mesh = extract_mesh(replace(fields, albedo=albedo))
-    assert np.ptp(vertex_colours(mesh), axis=0).max() == 0
 
 
 def test_the_ply_holds_srgb_colours_in_the_world_frame(tmp_path):
@@ -215,12 +167,6 @@ def test_the_glb_is_in_metres_y_up_with_linear_colours_and_no_metal(tmp_path):
     assert (material["metallicFactor"], material["roughnessFactor"]) == (0, 1)
     again = trimesh.load_mesh(tmp_path / "mesh.glb")
     assert len(again.faces) == len(mesh.faces) and again.volume > 0
-
-
-def test_scene_units_are_not_scaled(tmp_path):
-    mesh = extract_mesh(solved(sphere_grid(height=20), "scene"))
-    save_mesh(mesh, tmp_path / "mesh.ply", tmp_path / "mesh.glb", "scene")
-    assert np.ptp(accessor(*glb_parts(tmp_path / "mesh.glb"), 0, "<f4", 3), axis=0) == pytest.approx(20, abs=0.1)
 
 
 def test_an_empty_mesh_is_refused_and_leaves_no_file(tmp_path):

@@ -16,7 +16,6 @@ from calibration.flashlight.model import free_tangent
 from calibration.lights.mixed_light import MixedLight, PhotoLight, find_mixture
 from capture.checks.ambient_light import find_shadows
 from capture.checks.check_stack import check_stack
-from capture.checks.mixture import STEADY, levels, second_group
 from capture.session.session import Session, SessionSettings
 
 N = 18
@@ -84,23 +83,6 @@ def test_room_light_in_half_of_the_photos_is_named_and_the_others_are_right_also
     assert {(one.photo.name, one.kind) for one in found if one.drop} == {
         (f"IMG_{k}.jpg", "ambient light") for k in photos
     }
-
-
-@pytest.mark.parametrize("kind", ["normal", "laplace", "standard_t"])
-def test_numbers_of_one_group_are_hardly_ever_two(kind):
-    rng = np.random.default_rng(2)
-    draw = getattr(rng, kind)
-    drawn = [draw(3, size=24) if kind == "standard_t" else draw(size=24) for _ in range(200)]
-    assert sum(second_group(one, 0.01) is not None for one in drawn) <= 6
-    found = [second_group(one + 15 * (np.arange(24) > 12), 0.01) for one in drawn]
-    assert np.mean([one is not None and (one == (np.arange(24) > 12)).mean() > 0.9 for one in found]) > 0.9
-
-
-def test_a_number_that_is_not_known_is_in_no_group():
-    values = np.array([0.0] * 8 + [0.5] * 8 + [np.nan])
-    groups = second_group(values, STEADY)
-    assert groups is not None and groups.tolist() == [False] * 8 + [True] * 8 + [False]
-    assert np.isnan(levels(values, STEADY)[-1]) and set(levels(values, STEADY)[:-1]) == {0.0, 0.5}
 
 
 @pytest.mark.parametrize("cause", [None, "power", "second light"])

@@ -64,18 +64,6 @@ def test_photos_after_a_tap_are_moved_back_pan_tilt_and_roll(stack):
     assert np.array_equal(changed.rgb[:8], stack.rgb[:8])
 
 
-def test_a_phone_that_rolled_on_a_wooden_table_is_moved_back():
-    """A shift alone explains a roll badly, and grain tells little along itself: the angles take many steps then."""
-    rng, turn = np.random.default_rng(1), (0.0, 3.0, 7.0)
-    table = lit_table.table(rng)
-    grain = cv2.GaussianBlur(table, (0, 0), sigmaX=4, sigmaY=0.1)
-    wood = table.mean() + (grain - grain.mean()) * table.std() / grain.std()
-    stack = lit_table.stack_of(lit_table.lit_photos(N, rng, lit_table.with_object(wood)))
-    findings = check_and_register(with_turned(stack, dict.fromkeys(range(8, N), turn)))
-    assert [(one.photo.name, one.kind) for one in findings] == [(f"IMG_{k}.jpg", "registered") for k in range(8, N)]
-    assert all(off(np.reshape(one.homography, (3, 3)), turn) < 0.1 for one in findings)
-
-
 def test_saturated_pixels_move_with_their_photo(stack):
     turn = (0.0, 3.0, 0.0)
     changed = with_turned(stack, {5: turn})

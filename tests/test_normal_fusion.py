@@ -84,20 +84,6 @@ def test_wrong_normals_among_right_ones_hardly_tell():
     assert angle(after) < angle(uneven) / 2  # 3.2 degrees before, 0.4 without them, 1.1 with them
 
 
-def test_without_normals_the_surface_is_the_same():
-    uneven = ball(0.15)
-    assert combine_with_normals(uneven, [camera(uneven, eye, trust=0.0) for eye in EYES]) is uneven
-
-
-def test_what_no_camera_sees_stays():
-    uneven = ball(0.15)
-    after = combine_with_normals(uneven, [camera(uneven, EYES[0])])
-    hidden = torch.cat([seen(uneven, eye) for eye in EYES[1:]])
-    hidden = hidden[hidden[:, 0] < -3]  # the camera stands at +x
-    assert after.sdf(hidden).abs().max() < 0.1
-    assert after.sdf(seen(uneven, EYES[0])).abs().max() > 0.2
-
-
 def test_outlines_stay_where_pixels_see_them():
     """Normals that lean by 6 degrees would turn the ball's limb; pixels at the outline know where it is."""
     even = ball()

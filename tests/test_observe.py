@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import synthetic
 import torch
-from synthetic import BALL, HEAP, Box, Look, Sphere, default_lights, render
+from synthetic import BALL, HEAP, Box, Look, default_lights, render
 
 from reconstruct.labels import ground_test as ground_module
 from reconstruct.labels.labels import assemble_labels, not_isolated
-from reconstruct.labels.outline import local_mean, may_hold_shadow, object_region
+from reconstruct.labels.outline import may_hold_shadow, object_region
 from reconstruct.labels.photometric_stereo import label_object
-from reconstruct.scene import Scene, reduced
+from reconstruct.scene import Scene
 
 PLAIN = Look(width=160, height=120, n_lights=20)
 HARD = replace(PLAIN, texture=0.3, noise=0.004, ambient=0.05, lobe=(1.5, 0.5))
@@ -61,17 +61,6 @@ def test_the_albedo_of_the_ground_is_found_under_ambient_light():
     assert on[~truth.mask].mean() > 0.97 and np.median(error) < 0.01
 
 
-def test_lights_that_are_a_few_per_cent_off_do_not_turn_ground_into_object():
-    scene, truth = render(HEAP, HARD)
-    shift = torch.tensor(
-        np.random.default_rng(5).normal(0, 20, (len(scene.lights), 3)), dtype=torch.float32
-    )  # mm of about 500
-    moved = replace(scene, lights=torch.cat([scene.lights[:, :3] + shift, scene.lights[:, 3:]], 1))
-    found = ground_module.test_ground(moved)
-    assert iou(found.mask, truth) > 0.94
-    assert share_wrong(found.visibility, found.confidence, truth, ~truth.mask) < 0.003
-
-
 def test_the_ground_is_tested_again_only_when_lights_moved_by_more_than_its_gains_take_up():
     scene, _ = render((BALL,), PLAIN)
     first = ground_module.test_ground(scene)
@@ -82,31 +71,11 @@ def test_the_ground_is_tested_again_only_when_lights_moved_by_more_than_its_gain
     assert float(((again.mask - first.mask).abs() > 0.1).float().mean()) < 1e-3
 
 
-@pytest.mark.parametrize("window", [3, 9])
-def test_the_mean_of_a_window_counts_zeros_beyond_the_border(window):
-    image = torch.rand(2, 12, 17, generator=torch.Generator().manual_seed(0))
-    reach = window // 2
-    padded = torch.nn.functional.pad(image, (reach,) * 4).numpy()
-    direct = np.lib.stride_tricks.sliding_window_view(padded, (window, window), (1, 2)).mean((-1, -2))
-    np.testing.assert_allclose(local_mean(image, window).numpy(), direct, atol=1e-6)
-
-
 def test_the_light_inside_shadows_is_taken_out():
     scene, truth = render((BALL,), replace(PLAIN, ambient=0.16))
     found = ground_module.test_ground(replace(scene, ambient=torch.zeros(3)))  # as if it were light between surfaces
     full = (truth.visibility == 0) & ~truth.mask & (found.confidence.numpy() > 0.9)
     assert full.sum() > 1000 and np.quantile(found.visibility.numpy()[full], 0.9) < 0.03
-
-
-def test_without_an_object_nothing_is_object():
-    scene, _ = render((), HARD)
-    assert ground_module.test_ground(scene).mask.max() == 0
-
-
-def test_a_given_mask_is_kept():
-    scene, truth = render((BALL,), replace(PLAIN, with_mask=True))
-    found = ground_module.test_ground(scene)
-    assert np.array_equal(found.mask.numpy(), truth.mask.astype(np.float32))
 
 
 @pytest.mark.parametrize("look", [PLAIN, HARD, replace(PLAIN, kind="directional")])
@@ -154,17 +123,6 @@ def test_pixels_that_no_surface_explains_say_nothing():
     assert (found.confidence[:, others] - plain.confidence[:, others]).abs().mean() < 5e-3
 
 
-def test_labels_cover_ground_and_object_without_mixing_them():
-    scene, truth = render((BALL,), PLAIN)
-    found = ground_module.test_ground(scene)
-    labels = assemble_labels(scene, found, label_object(scene, tensor(truth.points), None, found.mask, found))
-    object_pixels = found.mask > 0.5
-    assert (labels.normals[~object_pixels] == 0).all() and (labels.normal_confidence[~object_pixels] == 0).all()
-    assert labels.confidence[:, object_pixels].mean() > 0.3
-    for value in (labels.visibility, labels.confidence, labels.mask, labels.mask_confidence, labels.normal_confidence):
-        assert value.min() >= 0 and value.max() <= 1
-
-
 def test_given_shadow_pictures_are_the_labels():
     scene, truth = render((BALL,), replace(PLAIN, with_shadow=True, with_mask=True))
     labels = assemble_labels(replace(scene, rgb=None), None, None)
@@ -187,49 +145,12 @@ def test_beside_colour_shadow_pictures_give_the_shadows_and_colour_the_normals_a
     assert torch.equal(labels.albedo[found.mask > 0.5], shading.albedo[found.mask > 0.5])
 
 
-def test_shadow_pictures_without_a_mask_leave_the_object_unknown():
-    scene, _ = render((BALL,), replace(PLAIN, with_shadow=True))
-    labels = assemble_labels(replace(scene, rgb=None), None, None)
-    assert labels.confidence.mean() > 0.999 and (labels.mask_confidence == 0).all()
-
-
-def test_the_pixels_of_a_small_object_are_read_with_its_own_albedo():
-    scene, truth = render((Sphere((0.0, 0.0, 8.0), 8.0, (0.3, 0.3, 0.3)),), PLAIN)
-    found = label_object(scene, tensor(truth.points), None, tensor(truth.mask))
-    trust = found.normal_confidence[torch.from_numpy(truth.mask)]
-    assert 40 < len(trust) < 120
-    assert trust.mean() > 0.45  # a third of the pixels are on the outline, where at most a quarter is left
-
-
-def test_small_holes_are_filled_and_an_opening_that_shows_ground_stays():
-    likely = torch.zeros(80, 80, dtype=torch.bool)
-    likely[10:70, 10:70] = True
-    likely[15:17, 15:17] = False  # 4 px, a stain
-    likely[30:50, 30:50] = False  # 400 px, as below a handle
-    region = object_region(likely, torch.ones(80, 80, dtype=torch.bool))
-    assert region[15, 15] and not region[40, 40]
-
-
-def test_what_touches_the_border_is_not_the_object_when_something_else_is():
-    likely = torch.zeros(80, 80, dtype=torch.bool)
-    likely[:, :30] = True  # beyond the table's edge
-    likely[40:60, 50:70] = True
-    region = object_region(likely, torch.ones(80, 80, dtype=torch.bool))
-    assert region[50, 60] and not region[40, 10]
-
-
 def test_an_object_cut_by_the_frame_is_the_object_though_there_is_a_speck_inside():
     likely = torch.zeros(80, 80, dtype=torch.bool)
     likely[20:60, :30] = True
     likely[50:53, 60:63] = True  # 5 px when its corners are smoothed away
     region = object_region(likely, torch.ones(80, 80, dtype=torch.bool))
     assert region[40, 10] and not region[51, 61]
-
-
-def test_two_balls_apart_are_both_object():
-    shapes = (Sphere((-40.0, 0.0, 25.0), 25.0), Sphere((40.0, 10.0, 18.0), 18.0))
-    scene, truth = render(shapes, PLAIN)
-    assert iou(ground_module.test_ground(scene).mask, truth) > 0.95
 
 
 def test_a_single_wrong_pixel_says_nothing_and_a_line_one_pixel_wide_does():
@@ -261,17 +182,6 @@ def test_ground_that_no_light_reaches_is_not_taken_for_a_sure_object():
     assert is_sure.numpy()[never_lit].mean() < 0.4
 
 
-def test_in_the_gaps_at_a_contact_the_mask_knows_its_errors():
-    legs = (Box((-40, -10, 0), (-28, 10, 40)), Box((28, -10, 0), (40, 10, 40)))
-    fine, truth = render((*legs, Box((-40, -10, 40), (40, 10, 50))), replace(PLAIN, width=320, height=240))
-    scene = reduced(fine, 160)  # four rays per pixel
-    coverage = truth.mask.reshape(120, 2, 160, 2).mean((1, 3))
-    found = ground_module.test_ground(scene)
-    wrong = np.abs(found.mask.numpy() - coverage)
-    assert wrong.mean() < 0.01
-    assert (wrong * found.mask_confidence.numpy()).sum() < 0.75 * wrong.sum()
-
-
 @pytest.mark.parametrize("lights, least", [(6, 0.8), (12, 0.99)])
 def test_parts_that_few_photos_light_belong_to_the_object_around_them(lights, least):
     scene, truth = render(HEAP, Look(width=200, height=150, n_lights=lights, noise=0.002, ambient=0.02))
@@ -291,16 +201,6 @@ def test_a_leg_of_another_colour_that_two_lights_reach_below_a_roof_is_object(li
     rgb = torch.where(torch.from_numpy(shown)[..., None], painted, scene.rgb)
     found = ground_module.test_ground(replace(scene, rgb=rgb)).mask.numpy() > 0.5
     assert found[shown].mean() > 0.95 and not (found & ~truth.mask).any()
-
-
-def test_photos_too_dark_to_tell_light_from_noise_say_nothing_of_shadows():
-    scene, truth = render(HEAP, PLAIN)
-    dimmed = torch.where(torch.arange(20) % 2 == 0, 0.02, 1.0)  # every other light
-    noise = 0.004 * torch.randn(scene.rgb.shape, generator=torch.Generator().manual_seed(0))
-    rgb = (scene.rgb * dimmed[:, None, None, None] + noise).clamp(0, 1)
-    found = ground_module.test_ground(replace(scene, rgb=rgb, power=scene.power * dimmed[:, None]))
-    assert share_wrong(found.visibility, found.confidence, truth, ~truth.mask) < 0.005
-    assert found.confidence[1::2].numpy()[:, ~truth.mask].mean() > 0.5
 
 
 def suns_of_one_height(look):

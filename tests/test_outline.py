@@ -5,19 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from synthetic import Box, Look, default_camera, render
+from synthetic import Box, Look, render
 
-from calibration.pose import Pose
-from reconstruct.config import FitConfig
-from reconstruct.initialization.choose_start import HullStart, choose_start
-from reconstruct.initialization.shadow_mask import with_object_mask
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.outline import outline_of
 from reconstruct.labels.supervision import supervise
 from reconstruct.scene import ground_points
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import first_hits
-from reconstruct.solve.trials import hull_is_better, shadow_doubts
+from reconstruct.solve.trials import shadow_doubts
 
 LOOK = Look(width=120, height=90, n_lights=16, with_shadow=True)
 TOP = Box((-40, -30, 40), (40, 30, 48))
@@ -59,19 +55,6 @@ def test_a_surface_that_lacks_a_part_is_doubted_and_the_true_one_is_not(table):
     assert shadow_doubts((scene,), (observer,), (rays,), of(TABLE, truth)) == ()
     (doubt,) = shadow_doubts((scene,), (observer,), (rays,), of((TOP, *LEGS), truth))
     assert "of the shadow that was set aside for a test" in doubt and "below 4 %" in doubt
-
-
-@pytest.mark.slow  # two small solves
-def test_a_table_from_straight_above_begins_as_a_hull():
-    camera, _ = default_camera(LOOK.width, LOOK.height)
-    down = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 520.0]))
-    scene, truth = render(TABLE, LOOK, (camera, down))
-    scene = with_object_mask(replace(scene, rgb=None))
-    assert scene.mask is not None and not scene.mask_known
-    found = scene.mask.numpy() > 0.5
-    assert (found & truth.mask).sum() > 0.9 * (found | truth.mask).sum()
-    start = choose_start(scene, Observer(scene), FitConfig(), judge=hull_is_better)
-    assert isinstance(start, HullStart)
 
 
 @pytest.mark.parametrize("shift", [1.5, -1.5])  # mm; a pixel is some 3 mm wide

@@ -88,17 +88,6 @@ def test_a_ray_meets_what_it_only_grazes(ball, off):
     assert (above > -0.03 * maps.pixel - 0.01 * np.array(least)).all()
 
 
-def test_where_a_search_along_rays_begins_changes_next_to_nothing(ball):
-    _, lights, maps = ball
-    every, rng = np.ones(len(lights), bool), np.random.default_rng(0)
-    wrong = lights * (1 + 0.05 * rng.standard_normal(lights.shape))
-    first = residuals(maps, wrong, EYE, every)
-    maps.first_height[:] = rng.uniform(0, TALLEST * maps.size, len(maps.first_height))
-    again = residuals(maps, wrong, EYE, every)
-    np.testing.assert_allclose(again.emptiness, first.emptiness, BETTER / (1 - BETTER), FINE * maps.pixel)
-    assert 0.1 < (first.emptiness > 0).mean() < 1 and first.emptiness.min() == 0
-
-
 def test_outlines_show_where_the_led_sits_beside_its_phones_lens(ball):
     camera, lights, maps = ball
     every, offset = np.ones(len(lights), bool), np.array([16.0, -9.0, 2.0])
@@ -238,17 +227,6 @@ def test_starts_are_of_several_heights(ball):
     assert all(np.abs(one - starts[0]).max() > 1 for one in starts[1:])
 
 
-def test_samples_too_dark_to_be_measured_are_shadow():
-    """The rim of a sharpened shadow is black; without it every shadow would seem to go on in the unknown."""
-    camera, _, field, shadows = photographed()
-    lit = shadows.visibility > 0.5
-    measured = lit | (np.random.default_rng(0).random(lit.shape) < 0.7)
-    maps, whole = (outline_maps(one, shadows, camera) for one in (replace(field, usable=measured), field))
-    assert maps is not None and whole is not None
-    np.testing.assert_array_equal(maps.is_cut, whole.is_cut)
-    np.testing.assert_array_equal(maps.dark, whole.dark)
-
-
 def test_a_part_that_is_lit_as_the_ground_is_makes_right_lights_contradict_unless_the_hull_is_unknown():
     """All of the ball but its rim is taken for lit ground."""
     camera, lights, field, shadows = photographed()
@@ -296,16 +274,6 @@ def test_a_photo_from_the_side_and_a_height_fix_the_scale_that_shadows_leave_fre
         moved = _moved_together(lights, share / EYE[2])
         free = _cost(maps, moved) - _cost(maps, lights)
         assert _cost(held, moved) - _cost(held, lights) > free + 2.0
-
-
-def test_a_view_from_the_side_tells_how_far_a_point_is_beside_the_ball():
-    view = _from_the_side()
-    across = np.cross(view.posed_camera.forward, [0.0, 0.0, 1.0])
-    across /= np.linalg.norm(across)
-    steps = np.array([-50.0, -20.0, 10.0, 40.0, 60.0])
-    found = view.emptiness(MIDDLE + steps[:, None] * across)
-    assert np.abs(found - (np.abs(steps) - RADIUS)).max() < 2.0  # a pixel is 1.8
-    assert view.emptiness(view.posed_camera.centre[None] * 2)[0] == -np.inf
 
 
 def test_the_field_finds_shadows_that_a_hot_beam_and_a_tone_curve_hide(ball):

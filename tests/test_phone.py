@@ -13,7 +13,6 @@ from calibration.flashlight.led_photo import BackView, LensReading
 from calibration.flashlight.model import Flashlights
 from calibration.flashlight.phone import (
     PhoneViews,
-    led_is_beside,
     locate_lights_from_phone,
     pair_in_order,
     pair_in_step,
@@ -74,18 +73,6 @@ def test_photos_without_a_board_or_with_wrong_corners_are_filled_by_shading(scen
     assert {"IMG_0002.jpg", "IMG_0006.jpg"}.isdisjoint(found.residuals["phone_photos"])
 
 
-@pytest.mark.slow  # 14 s more of the same fit
-def test_with_a_known_offset_a_phone_photo_that_was_not_taken_shifts_no_other_pair(scene):
-    truth, detections = scene
-    found = locate(truth, [*detections[:4], *detections[5:]], led_offset_mm=tuple(OFFSET))
-    np.testing.assert_allclose(found.residuals["led_offset_mm"], OFFSET, atol=1e-6)
-    assert "IMG_0004.jpg" not in found.residuals["phone_photos"]
-    assert found.residuals["phone_photos"]["IMG_0005.jpg"] == "IMG_0204.jpg"
-    assert np.delete(truth.errors(found.lights), 4).max() < 0.006  # the lens's focal length is known to 0.4 %
-    for light, true in zip(found.lights, truth.lights, strict=True):
-        assert np.linalg.norm(light.position - true.position) < 3 * np.linalg.norm(light.sigma)
-
-
 @pytest.mark.slow  # 30 s; test_phone_back.py has the photo itself
 def test_a_photo_of_the_back_mends_what_a_wrong_tone_curve_does_to_the_offset(scene):
     truth, detections = scene
@@ -136,17 +123,3 @@ def test_where_shading_is_far_off_phone_photos_are_paired_by_their_numbers():
     np.testing.assert_array_equal(pair_in_step(poses, flashlights, np.zeros(3), photos, nothing), photos)
     poses[3] = None
     assert pair_in_step(poses, flashlights, np.zeros(3), photos, nothing)[3] == -1
-
-
-def test_phone_photos_that_are_out_of_step_are_not_paired_by_their_numbers():
-    flashlights, poses = _handheld(20)
-    photos, nothing = np.arange(20), np.full(20, -1)
-    late = [*poses[1:], None]
-    np.testing.assert_array_equal(pair_in_step(late, flashlights, np.zeros(3), photos, nothing), nothing)
-
-
-@pytest.mark.parametrize(
-    ("offset", "may_be"), [((-14, 6, 0), True), ((25, -20, 8), True), ((-45, -55, 2), False), ((10, 5, -150), False)]
-)
-def test_an_led_lies_on_the_phones_back_not_far_from_its_lens(offset, may_be):
-    assert led_is_beside(np.array(offset, float)) == may_be

@@ -5,11 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_photos import look_at
 from phone_backs import BOARD, BackOfPhone, back_photo, save_back
 
 from calibration.flashlight.led_photo import BackView, LensReading, choose, in_lens_frame, read_phone_back
-from calibration.pose import Pose
 from capture.errors import CalibrationError, CaptureError
 from capture.session.declared_objects import PhoneBack
 from capture.session.session import load_session, load_settings
@@ -40,27 +38,6 @@ def test_led_and_lens_are_found_on_dark_and_bright_backs(tmp_path, shade):
 
 
 @pytest.mark.slow
-def test_all_lenses_are_candidates_from_a_slant_too(tmp_path):
-    slanted = look_at((140.0, -330.0, 420.0), (140.0, -80.0, 0.0))
-    view = read(tmp_path, THREE, world_from_camera=slanted)
-    assert len(view.lenses) == 3
-    assert nearest(offsets(view), OFFSETS).max() < 0.8
-    assert view.lenses[0].sigma_mm > 1.2  # differences of depth shift what is seen from aside
-
-
-def test_the_axes_are_those_of_a_phone_that_lies_top_to_top():
-    down, side, up = np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
-    world_from_lens = Pose(np.stack([down, side, up], 1), np.zeros(3))
-    assert np.linalg.det(world_from_lens.rotation) == pytest.approx(1)
-    offset = np.array([7.0, -11.0])
-    expected = world_from_lens.inverse().rotate(np.append(offset, 0.0))
-    np.testing.assert_allclose(in_lens_frame((7.0, -11.0), 0), expected, atol=1e-12)
-    quarter = np.array([[0.0, -1.0], [1.0, 0.0]])  # the phone and what is on it turned anticlockwise on the table
-    turned = tuple(map(float, quarter @ offset))
-    np.testing.assert_allclose(in_lens_frame((turned[0], turned[1]), 1), expected, atol=1e-12)
-
-
-@pytest.mark.slow
 def test_the_shading_tells_the_main_lens_of_three(tmp_path):
     true = in_lens_frame((10.0, 8.0), 0)  # the second lens of a phone that points to the board's top
     fitted = true + np.array([1.5, -2.0, 4.0])  # as well as the shading tells
@@ -68,13 +45,6 @@ def test_the_shading_tells_the_main_lens_of_three(tmp_path):
     assert choice.offset_mm is not None, choice.why
     np.testing.assert_allclose(choice.offset_mm[:2], true[:2], atol=0.7)
     assert 0 < choice.offset_mm[2] < 2  # of the 4 mm that the shading says
-
-
-def test_the_shading_tells_how_the_phone_was_laid(tmp_path):
-    true = in_lens_frame((10.0, -8.0), 0)
-    choice = choose(read(tmp_path, BackOfPhone(), turn=0.5 * np.pi), true + np.array([1.5, -2.0, 4.0]), 2.0)
-    assert choice.offset_mm is not None and "degrees of turn" in choice.why
-    np.testing.assert_allclose(choice.offset_mm[:2], true[:2], atol=0.7)
 
 
 def test_two_lenses_that_fit_alike_are_refused_with_their_pixels():

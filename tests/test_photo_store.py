@@ -8,7 +8,6 @@ from PIL import Image
 
 from capture.errors import CaptureError
 from capture.photos import photo
-from capture.photos.finding import Finding, keep_findings, kept_findings
 from capture.photos.photo import read_stack
 from capture.photos.store import CLIPPED, COLOURS, LIST
 
@@ -71,25 +70,8 @@ def test_a_list_that_is_none_starts_anew(paths, tmp_path, monkeypatch, content):
     assert len(opened) == len(paths) and np.array_equal(stack.rgb, read_stack(paths, 8).rgb)
 
 
-def test_another_size_or_another_list_of_photos_starts_anew(paths, tmp_path, monkeypatch):
-    kept = tmp_path / "kept"
-    read_again(paths, kept, monkeypatch)
-    assert len(read_again(paths, kept, monkeypatch, side=4)[1]) == len(paths)
-    assert len(read_again(paths[:4], kept, monkeypatch, side=4)[1]) == 4
-
-
 def test_photos_of_another_size_are_refused_by_name_on_disk_as_well(paths, tmp_path):
     Image.new("RGB", (20, 10)).save(paths[3])
     for _ in range(2):
         with pytest.raises(CaptureError, match=r"1 of 5 photos .* 3\.png \(20 x 10\)"):
             read_stack(paths, 8, kept=tmp_path / "kept")
-
-
-def test_findings_are_kept_with_the_photos_and_none_are_made_up(tmp_path, paths):
-    found = (Finding(paths[1], "blurred", "shaken", 0.5, 0.8, True),)
-    assert kept_findings(tmp_path, paths) is None
-    keep_findings(tmp_path, found)
-    assert kept_findings(tmp_path, paths) == found
-    assert kept_findings(tmp_path, paths[2:]) is None
-    (tmp_path / "findings.json").write_text('[{"photo": 3}]')
-    assert kept_findings(tmp_path, paths) is None

@@ -29,16 +29,6 @@ def test_the_translation_of_world_from_camera_is_the_camera_centre():
     assert np.array_equal(pose.apply(np.zeros(3)), [10, 20, 300])
 
 
-def test_directions_are_not_moved_by_the_translation():
-    pose = Pose(np.eye(3), np.array([1.0, 2.0, 3.0]))
-    assert np.array_equal(pose.rotate(np.array([0.0, 0, 1])), [0, 0, 1])
-
-
-def test_a_pose_survives_its_matrix():
-    pose = Pose(Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix(), np.array([1.0, 2.0, 3.0]))
-    assert Pose.from_matrix(pose.matrix()) == pose
-
-
 @pytest.mark.parametrize("matrix", [np.diag([1.0, 1, -1]), 1.01 * np.eye(3), np.full((3, 3), np.nan)])
 def test_a_mirror_a_scaling_and_nan_are_no_rotations(matrix):
     with pytest.raises(ValueError):

@@ -20,16 +20,6 @@ def test_what_trimesh_writes_is_read_back(tmp_path):
     np.testing.assert_allclose(found.vertices, mesh.vertices, atol=1e-5)
 
 
-def test_colours_and_numbers_of_a_finished_mesh_are_passed_over(tmp_path):
-    mesh = a_mesh()
-    mesh.visual.vertex_colors = np.tile(np.array([[9, 8, 7, 255]], np.uint8), (len(mesh.vertices), 1))
-    mesh.vertex_attributes["evidence"] = np.ones(len(mesh.vertices), np.uint8)
-    mesh.export(tmp_path / "mesh.ply")
-    found = read_preview(tmp_path / "mesh.ply")
-    assert found is not None
-    np.testing.assert_allclose(found.vertices, mesh.vertices, atol=1e-5)
-
-
 @pytest.mark.parametrize("kept", [0, 3, 40, 200, 2000, -1])
 def test_a_file_that_was_cut_is_no_mesh(tmp_path, kept):
     content = a_mesh().export(file_type="ply")
@@ -54,8 +44,4 @@ def test_a_header_that_is_not_ours_is_no_mesh(tmp_path, ours, theirs):
     content = a_mesh().export(file_type="ply")
     assert ours in content
     (tmp_path / "preview.ply").write_bytes(content.replace(ours, theirs, 1))
-    assert read_preview(tmp_path / "preview.ply") is None
-
-
-def test_an_absent_file_is_no_mesh(tmp_path):
     assert read_preview(tmp_path / "preview.ply") is None

@@ -1,4 +1,3 @@
-import cv2
 import numpy as np
 import pypdfium2
 import pytest
@@ -44,21 +43,6 @@ def test_the_ruler_is_as_long_as_it_says(tmp_path):
     assert len(ticks) == 11 and (ticks[-1] - ticks[0]) / dots == pytest.approx(100, abs=0.15)
 
 
-def test_markers_are_those_of_opencv(tmp_path):
-    shadowgraph.main(["board", str(tmp_path / "board.pdf")])
-    picture = np.asarray(Image.open(tmp_path / "board.png"))
-    board = parse_board(DEFAULT_BOARDS["charuco"])
-    ids = cv2.aruco.CharucoDetector(board.opencv()).detectBoard(picture)[1]
-    assert ids is not None and len(ids) == len(board.points())
-
-
 def test_a_board_too_large_for_the_paper_is_refused_with_both_sizes():
     with pytest.raises(CalibrationError, match=r"Letter has 215.9 x 279.4"):
         lay_out(parse_board("charuco:7x10:30:22:DICT_4X4_50"), "letter")
-
-
-def test_the_same_board_gives_the_same_files(tmp_path):
-    for name in ("one", "two"):
-        shadowgraph.main(["board", str(tmp_path / f"{name}.pdf")])
-    for suffix in (".pdf", ".png"):
-        assert (tmp_path / f"one{suffix}").read_bytes() == (tmp_path / f"two{suffix}").read_bytes()

@@ -18,7 +18,7 @@ from capture.photos.finding import Finding
 from reconstruct.check import verdict as readiness
 from reconstruct.check.light_coverage import from_the_camera, shadow_cover, side_in_words
 from reconstruct.check.readiness import judge, refuse_hopeless
-from reconstruct.check.verdict import CaptureCheck, tone_doubts
+from reconstruct.check.verdict import CaptureCheck
 from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import Photos
 from reconstruct.source.source import Source
@@ -29,7 +29,6 @@ from viewer.report.check_page import (
     back_picture,
     check_lines,
     check_page,
-    polar_plot,
     shadow_picture,
     write_check,
 )
@@ -58,15 +57,6 @@ def some_used(truth, keep):
         used = bool(keep(azimuth))
         lights.append(replace(light, used=used, reason="" if used else "left out"))
     return replace(truth.calibration, lights=tuple(lights))
-
-
-def test_shadows_and_object_are_where_they_were_rendered(truth, cover):
-    shadow = (truth.visibility < 0.5) & np.isfinite(truth.depth) & ~truth.mask
-    both = cover.times > 0
-    assert (both & shadow.any(0)).sum() > 0.85 * (both | shadow.any(0)).sum()
-    assert (cover.mask & truth.mask).sum() > 0.9 * (cover.mask | truth.mask).sum()
-    assert cover.with_shadow.all() and cover.ground_share > 0.5 and cover.ring_share > 0.6
-    assert np.linalg.norm(cover.centre[:2]) < 40  # the heap stands around the origin and is 110 mm wide
 
 
 def test_many_photos_from_all_around_are_good(truth, cover):
@@ -135,22 +125,6 @@ def test_the_larger_group_has_the_right_exposure_wherever_it_stands(truth):
         assert all(finding.value == pytest.approx(0.5, rel=0.06) for finding in found)
 
 
-@pytest.mark.parametrize("lit", [1, 26])
-def test_room_light_that_all_photos_show_is_no_matter_of_their_exposure(truth, lit):
-    calibration = with_powers(truth.calibration, [0.5] + [1.0] * 25)
-    room = [Finding(path, "ambient light", "", 0.1, 0.05, False) for path in truth.stack.paths[:lit]]
-    found = readiness.with_power_changes(room, calibration, truth.stack)
-    kept = [finding for finding in found if finding.kind == "ambient light"]
-    assert len(kept) == (26 if lit == 26 else 0) and found[-1].kind == "exposure changed"
-
-
-def test_with_three_exposures_the_largest_group_is_right(truth):
-    powers = [2.0] * 8 + [1.0] * 10 + [0.5] * 8
-    calibration = with_powers(truth.calibration, powers)
-    found = readiness.with_power_changes((), calibration, truth.stack)
-    assert [finding.photo for finding in found] == [*truth.stack.paths[:8], *truth.stack.paths[18:]]
-
-
 def test_a_tripod_that_moved_is_a_reason_and_the_advice_is_to_photograph_the_board_again(truth, cover):
     names = [light.photo for light in truth.calibration.lights]
     left_out = [Finding(Path(name), BOARD_OFF, "", 9.4, 0.6, True) for name in names[7:]]
@@ -191,12 +165,6 @@ def test_doubts_and_dropped_photos_are_reasons(truth, cover):
     assert "the tone curve is doubtful" in found.reasons
 
 
-def test_a_doubtful_tone_curve_is_said(truth):
-    doubted = replace(truth.calibration, residuals={"tone": {"doubt": "tone curve: BT.709 fits better"}})
-    assert tone_doubts(doubted) == ("tone curve: BT.709 fits better",)
-    assert tone_doubts(truth.calibration) == ()
-
-
 def test_the_page_and_the_terminal_say_it_all(truth, cover, tmp_path):
     half = some_used(truth, lambda azimuth: azimuth > 0)
     finding = Finding(Path(half.lights[0].photo), "over-exposed", "7% of the pixels <are> saturated", 0.07, 0.05, False)
@@ -230,19 +198,6 @@ def test_the_page_shows_what_was_taken_for_the_led_and_for_the_lens(truth, cover
     calibration = replace(truth.calibration, residuals={"phone_back": read})
     checked = CaptureCheck("heap", judge(calibration, (), cover), calibration, (), cover, (), path)
     assert "The flashlight&#x27;s phone" in check_page(checked).replace("'", "&#x27;")
-
-
-def test_the_polar_plot_has_the_camera_below_and_its_right_on_the_right(truth, cover):
-    turn = truth.calibration.world_from_camera.rotation[:, 0]
-    light = truth.calibration.lights[0]
-    centre = cover.centre
-    for way, inside in (
-        (turn * [1, 1, 0], lambda row, column: row == 5 and column > 15),
-        (-turn * [1, 1, 0], lambda row, column: row == 5 and column < 8),
-    ):
-        far = replace(light, position=centre + 1000 * (way / np.linalg.norm(way)) + [0, 0, 300.0])
-        rows = polar_plot(replace(truth.calibration, lights=(far,)), cover)
-        assert [inside(r, row.index("o")) for r, row in enumerate(rows) if "o" in row] == [True]
 
 
 @pytest.mark.parametrize("n_used", [26, 2])

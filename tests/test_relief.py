@@ -51,13 +51,6 @@ def test_ground_points_and_normals_are_those_of_the_bumps(truth):
     assert ground_points(reduced(scene, 60)).isfinite().all()
 
 
-def test_the_height_map_is_right_between_the_pixels(truth):
-    relief = ground_relief(scene_of(truth, "shadows"))
-    assert relief is not None
-    x, y = np.random.default_rng(0).uniform(-60, 60, (2, 500))
-    assert np.abs(relief.at(x, y) - ground_at(x, y)).mean() < 0.1
-
-
 def test_shadows_of_the_ground_on_itself_are_left_out_and_little_else(truth):
     scene = scene_of(truth, "shadows")
     relief = ground_relief(scene)
@@ -76,18 +69,6 @@ def test_photos_of_bumpy_ground_show_ground_and_object(truth):
     assert (found & truth.mask).sum() > 0.95 * (found | truth.mask).sum()
     assert ((labels.visibility.numpy() > 0.5) != (truth.shadow > 0.5))[told].mean() < 1e-3
     assert told.mean() > 0.8
-
-
-@pytest.mark.slow
-def test_the_hull_holds_the_ball_and_no_bump(truth):
-    scene = scene_of(truth, "photos")
-    grid = shadow_hull(scene, Observer(scene).ground_labels(), votes=1, nodes=40)
-    index = np.stack(np.meshgrid(*[np.arange(n) for n in grid.values.shape], indexing="ij"), -1)
-    nodes, inside = grid.origin.numpy() + grid.spacing * index, grid.values.numpy() < 0
-    above = nodes[..., 2] > ground_at(nodes[..., 0], nodes[..., 1])
-    distance = np.linalg.norm(nodes - np.array(BALL.centre), axis=-1) - BALL.radius
-    assert inside[above & (distance < -2.5 * grid.spacing)].mean() > 0.98
-    assert (inside & above).sum() * grid.spacing**3 < 1.4 * 4 / 3 * np.pi * BALL.radius**3
 
 
 def test_a_depth_map_of_level_ground_gives_the_hull_of_the_plane():

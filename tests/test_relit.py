@@ -49,15 +49,6 @@ def test_a_png_is_the_same_picture_in_srgb(run, tmp_path):
     assert np.array_equal(png, encode_srgb(linear))
 
 
-def test_brightness_is_a_factor_on_the_lamp(run, tmp_path):
-    one = colours(relit(run, tmp_path, "--light", "100,-200,400"))
-    two = colours(relit(run, tmp_path, "--light", "100,-200,400", "--brightness", "2"))
-    ambient = StoredRun(run).calibration.ambient
-    view = look(StoredRun(run).fields, WIDTH)
-    rest = (view.albedo * torch.as_tensor(ambient).float()).numpy()
-    assert np.allclose(two - rest, 2 * (one - rest), atol=1e-4)
-
-
 def test_a_far_lamp_lights_the_middle_as_the_captures_near_ones_did(run):
     it = StoredRun(run)
     middle = np.array([5.0, 5, 25])

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import find_surface, first_hits, in_line_of_sight, run, visibility
+from reconstruct.sdf.rays import run, visibility
 from reconstruct.torch_sdf import equations as render
 
 NODES, RADIUS = 40, 11.0
@@ -68,15 +68,6 @@ def test_every_equation_passes_gradcheck():
     assert check(lambda x: render.shadow_loss(0.1 + 0.8 * x, torch.full((4,), 0.3).double()), leaf(4))
 
 
-def test_the_moved_intersection_follows_a_growing_ball():
-    growth = torch.tensor(0.0, requires_grad=True)
-    point, view = torch.tensor([[0.0, 0.6, 0.8]]), torch.tensor([[0.0, 0.0, -1.0]])
-    moved = render.moved_intersection(point, view, (point.norm() - 1 - growth)[None], point)
-    moved[0, 2].backward()
-    # On the ball of radius 1 + e, z = sqrt((1 + e)^2 - 0.36): dz/de = 1 / 0.8 at e = 0.
-    torch.testing.assert_close(growth.grad, torch.tensor(1.25))
-
-
 def test_kernel_transmittance_equals_dense_sampling():
     grid = ball_grid()
     starts, ends = random_rays(400)
@@ -87,43 +78,6 @@ def test_kernel_transmittance_equals_dense_sampling():
         # Trilinear kinks and one refined parabola per minimum: 0.3 % on average (the study measured 0.2 %).
         assert (dense - marched).abs().mean() < 3e-3
         assert (dense - marched).abs().quantile(0.98) < 0.05
-
-
-def test_kernel_hits_lie_on_the_ball():
-    grid = ball_grid()
-    starts, ends = random_rays(400, seed=3)
-    along = torch.nn.functional.normalize(ends - starts, dim=-1)
-    t = find_surface(grid, starts, along)
-    hits = torch.isfinite(t)
-    points = starts[hits] + t[hits][:, None] * along[hits]
-    # Trilinear interpolation of a ball of radius 11 voxels is off by up to 1 / (8 * 11) voxel per axis.
-    assert ((points - CENTRE).norm(dim=-1) - RADIUS).abs().max() < 0.05
-    nearest = torch.linalg.cross(starts - CENTRE, along).norm(dim=-1)
-    heading = ((CENTRE - starts) * along).sum(-1) > 0
-    assert torch.equal(
-        hits[(nearest - RADIUS).abs() > 0.1], ((nearest < RADIUS) & heading)[(nearest - RADIUS).abs() > 0.1]
-    )
-
-
-def test_a_ray_meets_the_nearer_of_object_and_ground():
-    eye, ground = CENTRE + torch.tensor([0.0, 0.0, 60.0]), torch.tensor([10.0, 70.0, 70.0, torch.inf])
-    down, beside = [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]
-    first = first_hits(ball_grid(), eye, torch.tensor([down, down, beside, beside]), ground)
-    expected = torch.tensor([10.0, 60.0 - RADIUS, 70.0, torch.inf])
-    torch.testing.assert_close(first.distance, expected, atol=0.1, rtol=0)
-    assert first.on_object.tolist() == [False, True, False, False]
-
-
-def test_only_the_near_side_of_a_ball_is_in_line_of_sight():
-    eye, around = (
-        CENTRE + torch.tensor([0.0, 0.0, 60.0]),
-        torch.randn(200, 3, generator=torch.Generator().manual_seed(0)),
-    )
-    around = around / around.norm(dim=1, keepdim=True)
-    seen = in_line_of_sight(ball_grid(), eye, CENTRE + RADIUS * around, 1.0)
-    horizon = RADIUS / 60.0  # of the cosine to the eye
-    sure = (around[:, 2] - horizon).abs() > 0.1
-    assert torch.equal(seen[sure], around[sure, 2] > horizon)
 
 
 def test_the_parts_of_a_parallel_run_cover_everything_once():

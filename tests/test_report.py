@@ -11,7 +11,7 @@ import trimesh
 from calibration.calibration import save_calibration
 from reconstruct.check.light_coverage import widest_gap
 from reconstruct.run_folder.folder import RunFolder
-from viewer.report.drawing import depth_picture, difference_picture, mesh_picture, normal_picture, reduced
+from viewer.report.drawing import difference_picture, mesh_picture
 from viewer.report.figures import curves, lights_from_above
 from viewer.report.pictures import guess_facts, mesh_pictures
 from viewer.report.report import write_report
@@ -146,14 +146,6 @@ def test_a_damaged_file_is_named_and_the_rest_is_shown(tmp_path, truth, name):
     assert name in text or "depth.npy" in text
 
 
-def test_a_scene_in_its_own_unit_is_not_given_in_millimetres(tmp_path, truth):
-    fake_run.start_run(tmp_path, truth)
-    fake_run.finish_run(tmp_path, truth)
-    save_calibration(replace(fake_run.calibration_of(truth), unit="scene"), tmp_path / "calibration.json")
-    (tmp_path / "report.json").unlink()
-    assert " mm" not in Reader(page_of(tmp_path)).text.replace(" mm away", "")
-
-
 # --- pictures --------------------------------------------------------------------------------------------------------
 
 
@@ -165,44 +157,12 @@ def test_the_picture_of_a_ball_covers_a_disc_and_is_brighter_where_the_light_com
     assert picture[30, 50, 0] > picture[50, 70, 0] + 40
 
 
-def test_the_nearer_surface_hides_the_farther_one():
-    near, far = trimesh.creation.box((2, 2, 2)), trimesh.creation.box((8, 8, 2))
-    near.apply_translation((0, -10, 0))
-    near.visual.vertex_colors, far.visual.vertex_colors = [255, 0, 0, 255], [0, 0, 255, 255]
-    picture = mesh_picture(trimesh.util.concatenate([far, near]), np.array([0.0, -1.0, 0.001]), (100, 100), reach=5.0)
-    assert picture[50, 50, 0] > 100 and picture[50, 50, 2] == 0
-    assert picture[50, 80, 2] > 100 and picture[50, 80, 0] == 0
-
-
-def test_a_large_triangle_has_no_missing_pixels():
-    square = trimesh.Trimesh([[0, 0, 0], [9, 0, 0], [9, 9, 0.0], [0, 9, 0]], [[0, 1, 2], [0, 2, 3]])
-    picture = mesh_picture(square, np.array([0.0, -0.01, 1.0]), (200, 200), reach=4.0)
-    assert (picture[..., 3] == 255).all()
-
-
-def test_depth_runs_from_yellow_to_violet_and_nothing_is_transparent():
-    depth = np.array([[1.0, 2.0, np.inf]])
-    picture = depth_picture(depth, np.array([[True, True, False]]))
-    assert picture[0, 0, :3].tolist() == [253, 231, 137] and picture[0, 1, :3].tolist() == [68, 20, 84]
-    assert picture[0, 2, 3] == 0
-
-
-def test_a_normal_towards_the_sky_is_blue():
-    picture = normal_picture(np.array([[[0.0, 0.0, 1.0]]]), np.array([[True]]))
-    assert picture[0, 0].tolist() == [128, 128, 255, 255]
-
-
 def test_a_brighter_photo_is_red_a_darker_one_blue_and_an_equal_one_grey():
     photo = np.full((1, 3, 3), 100, np.uint8)
     computed = np.array([[[40] * 3, [160] * 3, [100] * 3]], np.uint8)
     red, blue, grey = difference_picture(photo, computed)[0].astype(int)
     assert red[0] > red[2] + 100 and blue[2] > blue[0] + 100
     assert np.ptp(grey) == 0
-
-
-def test_pictures_are_made_smaller_and_never_larger():
-    assert reduced(np.zeros((300, 400, 3), np.uint8), 100).shape == (75, 100, 3)
-    assert reduced(np.zeros((30, 40, 3), np.uint8), 100).shape == (30, 40, 3)
 
 
 # --- drawings --------------------------------------------------------------------------------------------------------

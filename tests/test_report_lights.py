@@ -40,13 +40,6 @@ def test_the_report_tells_how_far_each_light_moved_and_why_it_was_kept():
     assert "<td" in page and "2.5" in page  # the median
 
 
-def test_rejected_lights_are_not_drawn_and_no_trial_says_nothing():
-    calibration = uncertain()
-    page = refinement_part(told(calibration, [0.0] * 4, False), calibration, None)
-    assert "Refined lights decided upon." in page and "<svg" not in page
-    assert refinement_part({"light_trial": None}, calibration, None) == ""
-
-
 def test_lines_lead_to_where_the_lights_went_and_say_how_much_longer_they_are():
     calibration = uncertain()
     there = {

@@ -1,5 +1,4 @@
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,12 +32,6 @@ def test_a_saved_calibration_comes_back_equal(tmp_path):
     save_calibration(example(), tmp_path / "calibration.json")
     assert load_calibration(tmp_path / "calibration.json") == example()
     assert [path.name for path in tmp_path.iterdir()] == ["calibration.json"]
-
-
-def test_calibrations_that_differ_are_not_equal():
-    assert replace(example(), ground_height=0.0) != example()
-    assert replace(example(), lights=example().lights[:1]) != example()
-    assert example() != "calibration"
 
 
 def test_the_file_keeps_the_contract(tmp_path):
@@ -89,15 +82,6 @@ def test_a_wrong_field_is_refused_by_name(tmp_path, path, value, named):
     (tmp_path / "c.json").write_text(json.dumps(document))
     with pytest.raises(CalibrationError, match=named):
         load_calibration(tmp_path / "c.json")
-
-
-def test_every_missing_field_is_named(tmp_path):
-    save_calibration(example(), tmp_path / "c.json")
-    document = json.loads((tmp_path / "c.json").read_text())
-    for key in document:
-        (tmp_path / "c.json").write_text(json.dumps({k: v for k, v in document.items() if k != key}))
-        with pytest.raises(CalibrationError, match=f"{key} is missing"):
-            load_calibration(tmp_path / "c.json")
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "3", "\x00"])

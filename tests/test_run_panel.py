@@ -16,7 +16,7 @@ from capture.photos.photo import encode_srgb
 from reconstruct.run_folder.lock import is_abandoned
 from reconstruct.run_folder.requests import PAUSED, make_request, open_requests
 from reconstruct.sdf.grid import SdfGrid
-from viewer.display.run_follower import RunFollower, status
+from viewer.display.run_follower import RunFollower
 from viewer.page.guard import GuardedServer
 from viewer.page.page import Page
 from viewer.report.comparison import Comparison, compare_result, is_shadow_picture
@@ -89,15 +89,6 @@ def test_one_resolution_is_asked_for_at_a_time_and_can_be_taken_back(page, tmp_p
     assert run._resolution.value == "as planned"
 
 
-def test_a_run_that_is_not_there_is_asked_for_nothing(page, tmp_path):
-    (tmp_path / "lock").write_text(json.dumps(gone()))
-    run = page.controls.steering
-    for button in (run._pause, run._next, run._stop):
-        press(button)
-    choose(run._resolution, "fine")
-    assert open_requests(tmp_path) == frozenset() and not (tmp_path / "wishes").exists()
-
-
 def test_a_killed_run_counts_as_stopped_and_a_pause_left_over_is_named(page, tmp_path):
     make_request(tmp_path, "pause")
     (tmp_path / "lock").write_text(json.dumps(gone()))
@@ -118,11 +109,6 @@ def test_a_lock_that_cannot_be_read_yet_belongs_to_a_run(tmp_path, content):
     (tmp_path / "lock").write_text(json.dumps({"pid": os.getpid(), "started": me.create_time()}))
     assert not is_abandoned(tmp_path / "lock")
     assert not RunFollower(tmp_path / "elsewhere").is_running()
-
-
-def test_the_status_of_a_paused_run_keeps_its_place():
-    now = status([{"t": 9, "stage": "solve", "done": 34, "total": 120, "message": f"{PAUSED}press Go on"}], True)
-    assert (now.title, now.counts, now.message) == ("Paused while fitting the surface", "34 of 120", "")
 
 
 # --- the shadow hull and the comparison -----------------------------------------------------------------------------

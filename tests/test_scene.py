@@ -10,7 +10,7 @@ from synthetic import BALL, HEAP, Look, render
 from calibration.light import Light
 from calibration.light import irradiance as irradiance_by_calibration
 from capture.errors import ReconstructionError
-from reconstruct.scene import build_scene, ground_points, irradiance, lights_in_frame, reduced
+from reconstruct.scene import build_scene, irradiance, lights_in_frame, reduced
 
 SMALL = Look(width=60, height=44, n_lights=5)
 
@@ -89,25 +89,6 @@ def test_a_reduced_scene_looks_through_the_middle_of_the_pixels_it_joins():
     cosine = (half.directions * quads / quads.norm(dim=-1, keepdim=True)).sum(-1)
     assert cosine.min() > 1 - 1e-6  # 0.08 degrees, a tenth of a pixel
     assert half.pixel_angle == pytest.approx(2 * scene.pixel_angle)
-
-
-def test_a_clipped_pixel_taints_the_reduced_one():
-    _, truth = render((BALL,), SMALL)
-    clipped = np.zeros_like(truth.stack.clipped)
-    clipped[3, 7, 9] = True
-    scene = build_scene(replace(truth.stack, clipped=clipped), truth.calibration, 30)
-    assert (~scene.usable).nonzero().tolist() == [[3, 3, 4]]
-
-
-def test_ground_points_lie_on_the_ground_in_front_of_the_camera():
-    scene, truth = render((), SMALL)
-    assert np.allclose(ground_points(scene).numpy(), truth.points, atol=1e-3)
-
-
-def test_a_ray_above_the_horizon_has_no_ground_point():
-    scene, _ = render((BALL,), SMALL)
-    up = replace(scene, directions=-scene.directions)
-    assert ground_points(up).isnan().all()
 
 
 def test_in_another_frame_points_see_their_lights_where_they_saw_them():

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -32,15 +30,6 @@ def test_a_session_gives_camera_and_ground_from_its_board_photos(tmp_path):
     assert abs(posed_camera.camera.fx / CAMERA.fx - 1) < 0.01
     assert np.degrees(np.arccos(posed_camera.world_from_camera.rotation[2] @ poses[0].rotation[2])) < 0.3
     assert residuals["reprojection_rms_px"] < 0.3 and all(photo["used"] for photo in residuals["board_photos"])
-
-
-def test_the_ground_lies_below_the_print_by_the_thickness_of_paper_or_the_stated_one(tmp_path):
-    one = session(tmp_path, [look_at((150.0, -420.0, 380.0))])
-    paper, _, of_paper = fit_board(one, BOARD.spec())
-    plate, _, of_plate = fit_board(replace(one, settings=SessionSettings(board_thickness_mm=5.0)), BOARD.spec())
-    assert np.allclose(paper.centre, plate.centre)  # of the same world
-    assert (paper.ground_height, plate.ground_height) == (-0.1, -5.0)
-    assert of_plate["board_thickness_mm"] == 5.0 and of_paper["camera_height_sigma_mm"] > 0.1
 
 
 def test_a_board_photo_of_another_size_is_left_out_and_named(tmp_path):

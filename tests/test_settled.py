@@ -5,7 +5,7 @@ import pytest
 
 from reconstruct.sdf import kernels
 from reconstruct.sdf.blocks import Blocks, overlapping, pack
-from reconstruct.sdf.settled import Tiles, Views, unsettled_rays, unsettled_views, wide_field
+from reconstruct.sdf.settled import Tiles, Views, unsettled_rays, wide_field
 from reconstruct.sdf.settled_kernels import WIDE
 
 NODES, CENTRE, RADIUS = 48, np.array([24.0, 24.0, 16.0]), 11.0
@@ -97,26 +97,6 @@ def test_every_ray_that_contradicts_its_label_is_chosen():
     spoilt = np.random.default_rng(1).random(label.shape) < 0.01
     label[spoilt] = 1 - label[spoilt]
     assert chosen_rays(0.0, label, seen)[spoilt].mean() > 0.97  # but dark labels where a surface faces away
-
-
-def test_of_a_share_of_the_pixels_the_same_rays_are_chosen():
-    seen = views()
-    label = labels(seen)
-    every, some = chosen_rays(0.5, label, seen), chosen_rays(0.5, label, seen, 0.3)
-    assert 0.2 * every.sum() < some.sum() < 0.4 * every.sum()
-    needed = misses(ball(RADIUS), seen, label) > 0.003
-    taken = np.random.default_rng(0).random(WIDTH * HEIGHT) < 0.3
-    assert some[:, taken][needed[:, taken]].all() and not some[:, ~taken].any()
-
-
-def test_camera_rays_are_chosen_beside_the_outline_only():
-    seen = views()
-    mask = (seen.role == kernels.OBJECT).astype(np.float32)
-    closest = _distance(np.broadcast_to(EYE, seen.directions.shape), seen.directions)
-    found = unsettled_views(ball(RADIUS), seen, mask, np.ones_like(mask), 1.0)
-    beside = np.flatnonzero(np.abs(closest - RADIUS) < 0.9)
-    assert set(beside) <= set(found)
-    assert np.abs(closest[found] - RADIUS).max() < 2.5  # voxels: need, and the chord
 
 
 @pytest.mark.parametrize("radius", [3.0, RADIUS, 20.0])

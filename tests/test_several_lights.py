@@ -13,7 +13,7 @@ from test_solver import SMALL, Listener, depth_error
 
 from calibration.scenes.shadowneus import load_known_scene
 from capture.errors import CalibrationError, ReconstructionError
-from capture.photos.photo import PhotoStack, read_stack
+from capture.photos.photo import read_stack
 from reconstruct.labels import ground_test as ground
 from reconstruct.labels.multiple_lights import check_lights, is_shared, split_on_ground
 from reconstruct.labels.observer import Observer
@@ -57,16 +57,6 @@ def test_ground_shadows_of_both_lights_and_the_object_are_found():
     wrong = (found.visibility.numpy() > 0.5) != (truth.visibility > 0.5)
     assert (wrong * weight).sum() < 0.002 * weight.sum()
     assert weight.sum() > 0.85 * (~truth.mask).sum() * len(weight)
-
-
-def test_two_lights_that_send_the_same_are_not_told_apart_where_one_of_them_is_hidden():
-    scene, truth = render((BALL,), replace(LOOK, kind="directional", noise=0.0))
-    assert scene.rgb is not None
-    cosine = scene.lights[:, 2]
-    twins = replace(scene, power=scene.power / cosine[:, None], rgb=scene.rgb / cosine[:, None, None, None])
-    single = split_on_ground(added(twins))
-    one = (truth.visibility[0::2] != truth.visibility[1::2]).repeat(2, 0) & ~truth.mask
-    assert single.usable.numpy()[one].mean() < 0.1 < 0.95 < single.usable.numpy()[~one & ~truth.mask].mean()
 
 
 @pytest.mark.slow  # 11 s; the labels that such a solve is given are tested above
@@ -139,11 +129,3 @@ def test_a_trained_field_refuses_photos_under_several_lights():
     scene, _ = render((BALL,), replace(LOOK, n_lights=4))
     with pytest.raises(ReconstructionError, match="several lights at once"):
         train(added(scene), TrainConfig(), Listener())
-
-
-def test_photos_are_found_once_for_each_of_their_lights():
-    _, truth = render((BALL,), replace(LOOK, n_lights=4))
-    stack: PhotoStack = truth.stack
-    lights = tuple(replace(x, photo=stack.paths[k // 2].name) for k, x in enumerate(truth.calibration.lights))
-    scene = build_scene(stack, replace(truth.calibration, lights=lights), 120)
-    assert scene.photo_of_light is not None and scene.photo_of_light.tolist() == [0, 0, 1, 1]

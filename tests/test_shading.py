@@ -7,7 +7,6 @@ import pytest
 from flashlight_photos import (
     AMBIENT,
     CAMERA,
-    LOBE,
     POSED_CAMERA,
     POWER,
     WORLD_FROM_CAMERA,
@@ -30,7 +29,6 @@ from calibration.flashlight.model import (
 )
 from calibration.flashlight.uncertainty import beam_error, unseen_error
 from calibration.flashlight.wall import WALL_TERMS
-from calibration.light import beam_gain, irradiance
 from calibration.lights.ground_cells import sample_ground
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
@@ -70,39 +68,9 @@ def test_lights_are_found_wherever_the_camera_stands(near, reach):
     assert np.median(errors) < 0.03
 
 
-def test_positions_lie_within_their_stated_sigma(truth, found):
-    assert truth.share_inside(found.lights) > 0.9
-
-
-def test_beam_axes_and_lobe_are_found(truth, found):
-    for light, true in zip(found.lights, truth.lights, strict=True):
-        assert light.axis @ true.axis > np.cos(np.radians(3))
-    cosine = np.cos(np.radians([0, 15, 30, 45]))
-    np.testing.assert_allclose(beam_gain(cosine, found.beam), beam_gain(cosine, LOBE), atol=0.05)
-
-
 def test_ambient_light_is_found_relative_to_the_flashlight(found):
     power = np.median([light.power.mean() for light in found.lights])
     assert found.ambient.mean() / power == pytest.approx(AMBIENT / POWER, rel=0.2)
-
-
-def test_power_and_lobe_predict_the_photos_up_to_one_albedo_per_pixel(truth, found):
-    camera = CAMERA.resized(320, 240)
-    pixels = np.array([[60.0, 200.0], [250.0, 210.0], [40.0, 110.0], [285.0, 120.0]])
-    rays, eye = WORLD_FROM_CAMERA.rotate(camera.unproject(pixels)), WORLD_FROM_CAMERA.translation
-    points = eye - eye[2] / rays[:, 2:] * rays
-    up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    seen = truth.stack.rgb[:, pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
-    albedo = seen / np.stack([irradiance(points, up, light, found.beam) + found.ambient for light in found.lights])
-    lit = np.abs(np.log(albedo / np.median(albedo, axis=0))) < 0.5  # the others are in shadow
-    assert np.log(albedo / np.median(albedo, axis=0))[lit].std() < 0.025  # pixel noise is 0.01
-    assert lit.mean() > 0.8
-    assert 0.2 < np.median(albedo) < 0.9  # the brightest 1 % of ground is 0.9
-
-
-def test_noise_and_misfit_alone_are_of_the_size_of_the_error(truth, found):
-    sigma = np.array(list(found.residuals["position_sigma_by_photo"].values()))
-    assert 0.1 < np.median(np.linalg.norm(truth.off(found.lights), axis=1) / sigma) < 2
 
 
 def test_thejacobian_is_that_of_the_model(truth):
@@ -159,10 +127,6 @@ def test_beams_that_are_not_round_are_noticed_and_cost_little():
     assert found.residuals["beam_asymmetry"] == pytest.approx(0.03, abs=0.01)
     assert np.median(truth.errors(found.lights)) < 0.008  # 0.03 with round beams
     assert truth.share_inside(found.lights) >= 0.8
-
-
-def test_round_beams_stay_round(found):
-    assert found.residuals["beam_asymmetry"] == 0.0
 
 
 def test_six_photos_do_not_show_whether_the_beam_is_round_and_say_so():

@@ -7,7 +7,6 @@ import pytest
 import torch
 from synthetic import BALL, HEAP, Look, default_camera, render
 
-from calibration.ground.min_cut import cheapest_region, parts_of
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from reconstruct.initialization.choose_start import HullStart, choose_start
@@ -77,23 +76,3 @@ def test_pictures_without_a_shadow_are_refused_in_words():
     assert scene.shadow is not None
     with pytest.raises(ReconstructionError, match="24 shadow pictures show no shadow"):
         with_object_mask(replace(scene, rgb=None, shadow=torch.ones_like(scene.shadow)))
-
-
-def test_the_cheapest_region_follows_cheap_links():
-    cost_in, cost_out = np.full((9, 9), 0.1), np.zeros((9, 9))
-    cost_out[4, 4] = 50.0  # one pixel must be in; links cost 1, but along a square of 5 x 5 nothing
-    columns, rows = np.ones((9, 8)), np.ones((8, 9))
-    columns[2:7, [1, 6]] = 0
-    rows[[1, 6], 2:7] = 0
-    square = np.zeros((9, 9), bool)
-    square[2:7, 2:7] = True
-    assert np.array_equal(cheapest_region(cost_in, cost_out, columns, rows), square)
-
-
-def test_parts_are_joined_only_across_open_links():
-    region = np.ones((2, 4), bool)
-    region[0, 3] = False
-    columns, rows = np.ones((2, 3), bool), np.ones((1, 4), bool)
-    columns[:, 1] = False
-    parts = parts_of(region, columns, rows)
-    assert parts[0, 3] == 0 and len(np.unique(parts[region])) == 2 and parts[0, 0] == parts[1, 1] != parts[0, 2]

@@ -7,7 +7,7 @@ from dataset_folders import from_above, towards_lights, write_photo
 from synthetic import Look, Sphere, render
 
 from calibration.camera import Camera
-from calibration.lights.shiny_ball import Ball, Highlight, find_ball, reflected
+from calibration.lights.shiny_ball import Ball
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError, CaptureError
@@ -49,21 +49,6 @@ def write_capture(folder, truth, photos):
         write_photo(folder / f"shot_{i + 1:02d}.png", rgb)
 
 
-def test_the_mirror_law_gives_the_light_back_for_any_highlight():
-    """Seen along -z, the light at 2a from the view shines from the place where the normal is at a."""
-    camera = Camera(SIDE, SIDE, 1e6, 1e6, SIDE / 2 - 0.5, SIDE / 2 - 0.5)
-    posed = PosedCamera(camera, Pose(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 1e6])), 0.0)
-    for turn in (0.3, 2.0, 4.4):
-        a = np.radians(27.0)
-        at = Highlight(
-            BALL.x + BALL.radius * np.sin(a) * np.cos(turn), BALL.y - BALL.radius * np.sin(a) * np.sin(turn), 1.0
-        )
-        found, sigma = reflected(at, BALL, posed)
-        wanted = [np.sin(2 * a) * np.cos(turn), np.sin(2 * a) * np.sin(turn), np.cos(2 * a)]
-        np.testing.assert_allclose(found, wanted, atol=1e-3)
-        assert sigma == pytest.approx(2 * np.hypot(0.5, 0.2) / (BALL.radius * np.cos(a)), rel=1e-3)
-
-
 @pytest.mark.parametrize("is_named", [False, True])
 def test_photos_with_a_ball_need_neither_board_nor_list(tmp_path, photographed, is_named):
     write_capture(tmp_path, photographed, mirrored(photographed))
@@ -97,10 +82,6 @@ def test_a_named_ball_without_highlights_is_refused(tmp_path, photographed):
     (tmp_path / "session.toml").write_text('ball = "left"\n')
     with pytest.raises(CaptureError, match=r"ball is 'left'; needed: \[x, y, radius\]"):
         open_source(tmp_path, RunOptions())
-
-
-def test_a_matt_ball_is_not_taken_for_a_mirror(photographed):
-    assert find_ball(photographed.stack) is None
 
 
 def test_on_a_known_ground_the_ball_is_cut_from_the_surface():

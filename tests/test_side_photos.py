@@ -19,7 +19,7 @@ from calibration.side_photos.ground_look import TripodView, stood_there
 from calibration.side_photos.side_pose import side_pose
 from calibration.side_photos.side_views import TripodObject
 from calibration.side_photos.silhouette import find_silhouette, possible_region, share_shown
-from calibration.side_view import SideView, from_run_lengths, run_lengths
+from calibration.side_view import SideView
 from capture.errors import CalibrationError, CaptureError
 from capture.session.declared_objects import Height
 from capture.session.session import load_session, load_settings
@@ -67,12 +67,6 @@ def test_photos_in_side_and_the_height_are_read(tmp_path):
     session = load_session(folder)
     assert names(session.side) == ["S0.jpg", "S1.jpg"]
     assert session.settings.height == Height(120.0, 2.0)
-
-
-@pytest.mark.parametrize(("text", "height"), [("80", Height(80.0, 0.8)), ("20.5", Height(20.5, 0.5))])
-def test_a_height_has_a_rulers_error_unless_it_is_given(tmp_path, text, height):
-    (tmp_path / "session.toml").write_text(f"height = {text}\n")
-    assert load_settings(tmp_path).height == height
 
 
 @pytest.mark.parametrize("text", ["0", "-3", "true", '"tall"', '"1 +- 0"', "[1, 2]", "nan"])
@@ -158,10 +152,3 @@ def test_side_views_are_saved_with_the_calibration(tmp_path):
     (tmp_path / "wrong.json").write_text(text.replace('"size": [', '"size": [9, '))
     with pytest.raises(CalibrationError, match=r"side_views\[0\].size has 3 entries"):
         load_calibration(tmp_path / "wrong.json")
-
-
-@pytest.mark.parametrize("first", [True, False])
-def test_run_lengths_are_undone(first):
-    mask = np.random.default_rng(3).random((7, 9)) < 0.4
-    mask[0, 0] = first
-    assert np.array_equal(from_run_lengths(run_lengths(mask), (7, 9)), mask)

@@ -17,8 +17,6 @@ from reconstruct.fields import Fields, load_fields, save_fields
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
-from reconstruct.mesh.evidence import SEEN
-from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.render.g_buffer import albedo_at, seen_material, surface_maps
 from reconstruct.render.joined import join_views
 from reconstruct.scene import Scene
@@ -89,49 +87,6 @@ def test_several_views_find_the_side_that_one_does_not_see(views, solved):
     assert error(solved.grid, before) < 1.1 * error(alone.grid, before)  # views more never make it worse
 
 
-def test_every_camera_sees_the_surface(solved):
-    mesh = extract_mesh(solved)
-    assert len(solved.further) == 2
-    share = float((mesh.vertex_attributes["evidence"] == SEEN).mean())
-    alone = float((extract_mesh(replace(solved, further=())).vertex_attributes["evidence"] == SEEN).mean())
-    assert share > 0.7 > 0.5 > alone  # the base, which stands on the ground, is a fifth
-
-
-@pytest.mark.slow
-def test_one_view_in_a_tuple_is_one_view(views):
-    scene = views[0][1]
-    short = replace(QUICK, levels=(replace(QUICK.levels[0], iterations=4),))
-    one, other = fit(scene, short, lambda **_: None), fit((scene,), short, lambda **_: None)
-    assert torch.equal(one.grid.values, other.grid.values)
-    torch.testing.assert_close(one.albedo, other.albedo, rtol=0, atol=0, equal_nan=True)
-
-
-@pytest.mark.slow
-def test_a_stopped_solve_of_several_views_goes_on_to_the_same_bits(views, solved, tmp_path):
-    file, count = tmp_path / "checkpoint.safetensors", []
-
-    def stop(*, stage: str, **_) -> None:
-        count.extend([stage] if stage == "solve" else [])
-        if len(count) > 24:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fit(views[0], QUICK, stop, file)
-    again = fit(views[0], QUICK, lambda **_: None, file)
-    assert torch.equal(again.grid.values, solved.grid.values)
-
-
-def test_albedo_is_that_of_the_surface_whatever_view_shows_it(solved):
-    points = points_on()
-    points = points[points[:, 2] > 20]
-    found = albedo_at(solved, seen_material(solved), torch.from_numpy(points).float(), torch.ones(len(points)) > 0)
-    low = np.linalg.norm(points - SHAPES[0].centre, axis=1) < SHAPES[0].radius + 1e-6
-    true = np.where(low[:, None], SHAPES[0].albedo, SHAPES[1].albedo)
-    apart = np.abs(np.linalg.norm(points - SHAPES[1].centre, axis=1) - SHAPES[1].radius) > 6
-    apart |= ~low  # at the boundary of the two colours a pixel of 4 mm mixes them
-    assert float(np.median(np.abs(found.numpy() - true)[apart])) < 0.04
-
-
 def exact_views(gains: tuple[tuple[float, float, float], ...]) -> list[Fields]:
     """The true surface and the true, patterned albedo as three cameras see it, each in a scale of its own."""
     axes = [np.arange(lower, upper, 1.5) for lower, upper in ((-38, 38), (-38, 38), (-6, 82))]
@@ -179,11 +134,6 @@ def test_no_seam_is_left_where_the_sight_of_a_view_ends():
     pairs = KDTree(points.numpy()).query_pairs(3.0, output_type="ndarray")
     apart = np.abs(found[pairs[:, 0]] - found[pairs[:, 1]])
     assert float(np.quantile(apart, 0.99)) < 0.03  # of white
-
-
-def test_one_view_keeps_its_material():
-    (view,) = exact_views(((1.0, 1.2, 1.0),))
-    assert join_views([view]) is view
 
 
 def test_a_solved_scene_of_several_cameras_equals_its_file(solved, tmp_path):

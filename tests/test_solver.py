@@ -2,19 +2,16 @@
 
 from dataclasses import replace
 
-import fake_run
 import numpy as np
 import pytest
 import torch
 from synthetic import BALL, Look, render
 
-from reconstruct.fields import load_fields, save_fields
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import supervise
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import find_surface
 from reconstruct.solve import solver
-from reconstruct.solve.checkpoint import load_state
 from reconstruct.solve.operators import RayPasses
 from reconstruct.solve.solver import FitConfig, Level, fit
 
@@ -64,50 +61,6 @@ def test_photos_alone_give_the_ball():
     assert depth_error(fields, scene, truth) < 0.06 * BALL.radius
     seen = torch.from_numpy(truth.mask)
     assert 0.3 < float(fields.albedo[seen].mean()) < 1.0
-
-
-@pytest.mark.slow  # 10 s; test_crash.py stops solves at more places
-def test_a_solve_that_was_stopped_ends_in_the_very_same_surface(tmp_path, monkeypatch):
-    monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
-    scene, _ = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=12))
-    scene = replace(scene, rgb=None)
-    straight = fit(scene, SMALL, Listener())
-    file = tmp_path / "checkpoint.safetensors"
-    with pytest.raises(KeyboardInterrupt):
-        fit(scene, SMALL, Listener(stop_at=47), file)
-    listener = Listener()
-    resumed = fit(scene, SMALL, listener, file)
-    assert listener.lines[0][1] == 41  # of 60: the last rest before the stop was after 40
-    torch.testing.assert_close(resumed.grid.values, straight.grid.values, rtol=0, atol=0)
-
-
-def test_a_checkpoint_of_other_settings_is_not_resumed(tmp_path, monkeypatch):
-    monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
-    scene, _ = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=8))
-    scene = replace(scene, rgb=None)
-    file = tmp_path / "checkpoint.safetensors"
-    with pytest.raises(KeyboardInterrupt):
-        fit(scene, SMALL, Listener(stop_at=21), file)
-    listener = Listener(stop_at=1)
-    with pytest.raises(KeyboardInterrupt):
-        fit(scene, replace(SMALL, seed=1), listener, file)
-    assert listener.lines[0][0] == "hull"
-
-
-def test_a_damaged_checkpoint_counts_as_none(tmp_path):
-    file = tmp_path / "checkpoint.safetensors"
-    file.write_bytes(b"not a checkpoint")
-    assert load_state(file, "any") is None
-
-
-def test_fields_come_back_from_their_file(tmp_path, truth):
-    fields = fake_run.fields_of(truth)
-    save_fields(fields, tmp_path / "fields.safetensors")
-    back = load_fields(tmp_path / "fields.safetensors")
-    torch.testing.assert_close(back.grid.values, fields.grid.values)
-    torch.testing.assert_close(back.albedo, fields.albedo, atol=1e-3, rtol=1e-3)  # stored in half precision
-    assert back.camera == fields.camera and back.unit == fields.unit
-    assert np.allclose(back.world_from_camera.matrix(), fields.world_from_camera.matrix())
 
 
 def test_the_true_surface_is_left_alone_by_its_own_shadows():

@@ -1,6 +1,5 @@
 """The stage in one file, opened from a file in a real browser and compared with our own renderer."""
 
-import gzip
 import io
 import json
 import shutil
@@ -20,11 +19,11 @@ from calibration.camera import Camera
 from calibration.light import Light
 from calibration.posed_camera import PosedCamera
 from capture.errors import ReconstructionError
-from capture.photos.photo import decode_srgb, encode_srgb
+from capture.photos.photo import decode_srgb
 from reconstruct.export.export import export
 from reconstruct.export.first_view import LAMP as FIRST_LAMP
 from reconstruct.export.first_view import SKY
-from reconstruct.export.stage_scene import filled, ground_pictures, stage_scene
+from reconstruct.export.stage_scene import stage_scene
 from reconstruct.render.g_buffer import look
 from reconstruct.render.relight import lit_share, relight
 from reconstruct.render.studio import FOCAL_HEIGHTS, Studio, looking_at, studio_of, towards
@@ -33,8 +32,6 @@ from reconstruct.stored_run.stored_run import StoredRun
 from viewer.report.formats import FORMATS
 from viewer.stage import page as stage_page_module
 from viewer.stage.cameras import camera_facts, light_facts
-from viewer.stage.facts import known_shares
-from viewer.stage.pack import packed, unpacked_corners
 
 WIDTH, HEIGHT = 320, 240
 VIEW = {"azimuth": -1.2, "elevation": 0.7, "distance": 420.0, "focal": FOCAL_HEIGHTS, "shift": [0, 0]}
@@ -60,19 +57,6 @@ def stage(run) -> Studio:
 # --- what the page is told ---------------------------------------------------------------------------------------
 
 
-def test_ground_that_no_photo_lights_continues_the_ground_around_it():
-    albedo = np.full((60, 80, 3), 0.5, np.float32)
-    albedo[20:24, 30:36] = 0  # under a belly
-    ground = np.ones((60, 80), bool)
-    ground[30:50, 30:50] = False  # the object
-    albedo[30:50, 30:50] = [0.9, 0.1, 0.1]
-    picture, mean = ground_pictures(albedo, ground)
-    grey = encode_srgb(np.full(3, 0.5, np.float32))
-    assert np.abs(picture.astype(int) - grey).max() <= 1 and np.abs(mean.astype(int) - grey).max() <= 1
-    black, mean = ground_pictures(np.zeros_like(albedo), ground)  # all of it: nothing better is known
-    assert not black.any() and not mean.any()
-
-
 def test_cameras_and_lights_of_another_lie_are_told_in_the_frame_of_the_surface(tmp_path):
     run = StoredRun(laid_anew(tmp_path / "whole", make_truth(width=64, n_lights=4)))
     studio = studio_of(np.asarray(run.mesh.bounds))
@@ -87,38 +71,6 @@ def test_cameras_and_lights_of_another_lie_are_told_in_the_frame_of_the_surface(
 
 
 # --- what is packed --------------------------------------------------------------------------------------------------
-
-
-def test_what_is_packed_is_the_mesh_to_a_few_micrometres(run):
-    stored = StoredRun(run)
-    scene, studio = stage_scene(stored), studio_of(np.asarray(stored.mesh.bounds))
-    block = packed(scene, studio.centre, studio.radius)
-    assert np.array_equal(unpacked_corners(block.content, block.parts), scene.faces.reshape(-1))
-    raw, n = np.frombuffer(gzip.decompress(block.content), np.uint8), len(scene.vertices)
-    planes = raw[: 6 * n].reshape(2, 3, n).astype(int)
-    low, high = (np.array(block.parts["places"][end]) for end in ("low", "high"))
-    places = low + (planes[0] << 8 | planes[1]).T / 65535 * (high - low)
-    assert np.abs(places * studio.radius + studio.centre - scene.vertices).max() < 1e-4 * studio.radius
-
-
-def test_unknown_pixels_continue_the_known_ones_without_a_seam():
-    x, y = np.meshgrid(np.arange(64.0), np.arange(48.0))
-    ramp = np.repeat((0.01 * x + 0.002 * y)[..., None], 3, 2).astype(np.float32)
-    known = np.hypot(x - 30, y - 20) > 12
-    out = filled(np.where(known[..., None], ramp, 0), known)
-    assert np.array_equal(out[known], ramp[known])
-    assert np.abs(out - ramp)[~known].max() < 0.1  # of a ramp that rises by 0.24 across the hole
-    assert np.abs(np.diff(out, axis=1)).max() < 0.1  # nowhere a step
-
-
-def test_the_page_says_how_much_is_a_guess_as_the_report_does(run, tmp_path):
-    copy = tmp_path / "known"
-    shutil.copytree(run, copy)
-    report = json.loads((copy / "report.json").read_text()) if (copy / "report.json").exists() else {}
-    shares = {"seen": 0.5, "shadow": 0.3, "unconstrained": 0.2}
-    report["mesh"] = {"evidence": {kind: {"share": share} for kind, share in shares.items()}}
-    (copy / "report.json").write_text(json.dumps(report))
-    assert known_shares(StoredRun(copy)) == {"seen in the photos": 0.5, "held by shadows": 0.3, "a guess": 0.2}
 
 
 def test_the_page_is_one_small_file_that_asks_for_nothing(page_file):
@@ -272,16 +224,6 @@ def test_the_light_follows_the_mouse_and_dragging_turns_the_view(tab):
     tab.mouse.up()
     assert tab.evaluate("shadowgraph.state()")["view"]["azimuth"] > VIEW["azimuth"] + 0.3
     drawn_until(tab, lambda now: differing(now, lit) > 0.05)
-
-
-@pytest.mark.browser
-@pytest.mark.slow
-def test_a_large_lamp_makes_a_soft_edge(tab):
-    hard = shown(tab, VIEW, LAMP, 4).astype(int).sum(-1)
-    soft = shown(tab, VIEW, LAMP | {"radius": 90.0}, 4).astype(int).sum(-1)
-    changed = np.abs(soft - hard) > 40
-    assert 0.01 < changed.mean() < 0.3  # the edges of shadows, and what faces away from the lamp's middle
-    assert not tab.said
 
 
 @pytest.mark.browser

@@ -11,7 +11,6 @@ from chromium import wait_until
 from capture.errors import UserError
 from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
 from viewer.page.guard import GuardedServer
-from viewer.page.serve import address_lines
 from viewer.stage.files import StageFiles
 
 
@@ -76,22 +75,11 @@ def eventually(address: str, path: str) -> bytes:
     return content
 
 
-def test_another_origin_may_not_write_notes(address, run):
-    with pytest.raises(websockets.exceptions.InvalidStatus):
-        websockets.sync.client.connect(f"ws://{address}/stage/stage.json", origin="http://evil.example")
-    assert not (run / "stage.json").exists()
-
-
 def test_a_run_that_is_not_finished_says_so(tmp_path):
     files = StageFiles(tmp_path)
     assert not files.is_ready
     with pytest.raises(UserError, match="no finished run"):
         files.get("")
-
-
-def test_the_printed_address_of_a_finished_run_is_that_of_its_picture():
-    assert address_lines("127.0.0.1", 8080, path="stage/")[0] == "Open http://localhost:8080/stage/"
-    assert "8080/stage/?token=abc" in address_lines("0.0.0.0", 8080, "abc", "stage/")[0]
 
 
 @pytest.mark.browser

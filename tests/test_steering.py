@@ -135,16 +135,6 @@ def test_only_requests_of_the_fixed_set_can_be_made_and_only_they_are_read(tmp_p
     assert open_requests(tmp_path) == {"pause", "next-level", "stop", "fine"}
 
 
-def test_a_run_that_starts_anew_forgets_a_pause_and_says_so(tmp_path):
-    make_request(tmp_path, "pause")
-    saved = []
-    with RunFolder(tmp_path) as run:
-        assert run.forgotten == {"pause"}
-        RequestSteering(run).wait(lambda: saved.append("before a pause"))
-    assert not saved
-    assert not (tmp_path / "wishes").exists()
-
-
 def test_a_stage_that_is_reopened_is_done_again_by_the_next_run(tmp_path):
     with RunFolder(tmp_path) as run:
         run.claim({}, {})

@@ -23,10 +23,9 @@ from PIL import Image
 from safetensors.torch import load
 
 import shadowgraph
-from calibration.calibration import MOST_LIGHTS, load_calibration
+from calibration.calibration import load_calibration
 from capture.errors import UserError
 from capture.files.atomic import atomic_file
-from capture.files.regular import open_regular, read_regular
 from reconstruct.export.export import export
 from reconstruct.fields import load_fields
 from reconstruct.mesh.mesh import vertex_colours
@@ -35,9 +34,8 @@ from reconstruct.stored_run.maps import read_thumbnail
 from reconstruct.stored_run.ply import read_mesh
 from reconstruct.stored_run.stored_run import StoredRun
 from reconstruct.tensor_file import read_tensors, write_tensors
-from shadowgraph.faults import sentence_for
 from viewer.display.run_follower import RunFollower, status
-from viewer.report.report import read_results, report_page, write_report
+from viewer.report.report import read_results, write_report
 from viewer.stage.pack_file import stored_stage
 
 ROOT = Path(__file__).parent.parent
@@ -69,14 +67,6 @@ def read_all(run: Path) -> list[str]:
     results = read_results(run)
     assert "\n" not in "".join(said)
     return [*said, *results.problems]
-
-
-def test_a_whole_run_is_read_without_a_word(whole):
-    assert read_all(whole) == []
-    stored = StoredRun(whole)
-    assert stored.detail is not None and stored.fields.gloss is not None
-    assert stored.maps.depth.shape == stored.maps.mask.shape == (48, 64)
-    assert "a note" in report_page(read_results(whole))
 
 
 def test_a_whole_run_of_several_views_and_lies_is_read_without_a_word(tmp_path):
@@ -172,16 +162,6 @@ def test_only_regular_files_of_a_fitting_size_are_opened_and_nobody_waits(kind, 
         assert any(name in line for line in said), name
 
 
-def test_a_file_that_is_opened_says_what_it_is_instead(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    (tmp_path / "link").symlink_to(tmp_path / "pipe")
-    (tmp_path / "large").write_bytes(bytes(100))
-    for name, match in (("pipe", "a pipe"), ("link", "a link"), ("large", "at most"), ("absent", "No such file")):
-        with pytest.raises(OSError, match=match):
-            open_regular(tmp_path / name, 99)
-    assert read_regular(tmp_path / "large", 100) == bytes(100)
-
-
 def test_nothing_is_written_where_a_link_leads(run, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (run / "exports").symlink_to(tmp_path / "elsewhere")
@@ -260,12 +240,6 @@ def document_with(run: Path, name: str, change) -> Path:
     change(document)
     (run / name).write_text(json.dumps(document))
     return run / name
-
-
-def test_a_hundred_thousand_lights_are_refused_by_their_number(run):
-    path = document_with(run, "calibration.json", lambda d: d.update(lights=d["lights"] * 20_000))
-    with pytest.raises(UserError, match=f"lights has 120,000 entries, at most {MOST_LIGHTS:,}"):
-        load_calibration(path)
 
 
 @pytest.mark.parametrize("name", ["../../secret", "/etc/passwd", "a/b.jpg", "", "..", "a\0b", "x" * 300])
@@ -360,11 +334,6 @@ def test_a_bug_report_tells_nothing_of_where_the_photos_were_taken(run, tmp_path
     for name, content in contents.items():
         for secret in (b"SERIAL4711", b"Exif", b"13.4050", str(home).encode(), b"scans"):
             assert secret not in content, (name, secret)
-
-
-def test_a_sentence_about_a_file_does_not_command_the_terminal():
-    said = sentence_for(UserError("light \x1b[2J\x07 of 'größe\n.jpg'"))
-    assert said == "light  [2J  of 'größe .jpg'"
 
 
 # --- whole commands --------------------------------------------------------------------------------------------------

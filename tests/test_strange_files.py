@@ -227,17 +227,6 @@ def test_an_archive_whose_name_runs_into_its_data_is_refused_without_quoting_the
     assert str(path) in str(refused.value) and len(str(refused.value)) < len(str(path)) + 500
 
 
-@pytest.mark.parametrize("kind", [np.float32, np.int16, bool])
-def test_arrays_of_any_numbers_come_back_in_any_order_of_memory(tmp_path, kind):
-    wanted = np.asfortranarray(np.arange(24).reshape(2, 3, 4) % 2).astype(kind)
-    np.save(tmp_path / "a.npy", wanted)
-    np.savez_compressed(tmp_path / "a.npz", first=wanted, second=np.float64(3.5))
-    np.testing.assert_array_equal(read_npy(tmp_path / "a.npy"), wanted)
-    found = read_npz(tmp_path / "a.npz", ("first", "second"))
-    np.testing.assert_array_equal(found["first"], wanted)
-    assert found["second"].shape == () and float(found["second"]) == 3.5
-
-
 # --- names -----------------------------------------------------------------------------------------------------------
 
 

@@ -14,9 +14,7 @@ from waiting import wait_until
 
 from capture.errors import CaptureError, UserError
 from capture.files.atomic import write_json
-from viewer.display.run_follower import RunFollower
 from viewer.studio.folder import StudioFolder
-from viewer.studio.progress import run_progress
 from viewer.studio.trash import Trash
 from viewer.studio_server.serve import serve
 
@@ -111,13 +109,6 @@ def test_a_run_waits_runs_and_finishes_and_a_capture_that_runs_is_not_deleted(fo
         wait_until(lambda: not any(job.is_open for job in studio.queue.jobs))
         runs = owner.get("/api/state")[1]["cards"][0]["runs"]
         assert {run["state"] for run in runs} == {"finished"}
-
-
-def test_the_clock_of_a_run_does_not_go_back_when_its_process_writes_its_first_line(tmp_path):
-    follower = RunFollower(tmp_path)
-    before = run_progress(follower, since_last_line_s=2.0, started_s=2.0).elapsed_s
-    fake_run.log_line(tmp_path, 0.1, "capture", 0, 1, "reading")
-    assert run_progress(follower, since_last_line_s=0.0, started_s=2.3).elapsed_s > before == 2.0
 
 
 def test_photos_arrive_are_looked_at_and_named_when_they_are_no_photos(folder):

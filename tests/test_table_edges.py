@@ -5,7 +5,7 @@ import pytest
 
 from calibration.ground.ground_field import at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import GROUND_LIKE, find_shadows
-from calibration.ground.table_edges import find_table_edges, on_table, seen_beyond
+from calibration.ground.table_edges import find_table_edges, seen_beyond
 
 EYE = np.array([0.0, -500.0, 400.0])
 HEIGHT, WIDTH, PHOTOS = 96, 128, 12
@@ -85,29 +85,6 @@ def test_the_straight_edges_of_a_high_object_are_no_edge_of_the_ground(count):
     assert not find_table_edges(rgb, everywhere(rgb), points, EYE)
 
 
-def test_an_exposure_that_changes_from_photo_to_photo_is_no_edge_and_hides_none():
-    points, rng = table_points(), np.random.default_rng(3)
-    gains = np.exp(rng.normal(0, 0.5, (PHOTOS, 1, 1, 1))).astype(np.float32)
-    whole = photos(points, np.isfinite(points[..., 0]), 0.0, rng) * gains
-    assert not find_table_edges(whole, everywhere(whole), points, EYE)
-    ends = photos(points, ~outside(points, 90.0, 110.0), 700.0, rng) * gains
-    assert len(find_table_edges(ends, everywhere(ends), points, EYE)) == 1
-
-
-@pytest.mark.parametrize(("share", "count"), [(0.45, 1), (0.85, 0)])
-def test_a_wall_may_fill_half_of_the_picture_but_not_all_but_the_object(share, count):
-    points, rng = table_points(), np.random.default_rng(5)
-    beyond = outside(points, 90.0, float(np.nanquantile(points[..., 1], 1 - share)))
-    rgb = photos(points, ~beyond, 700.0, rng)
-    assert len(find_table_edges(rgb, everywhere(rgb), points, EYE)) == count
-
-
-def test_in_a_picture_smaller_than_is_looked_at_no_edge_is_found():
-    points, rng = table_points(), np.random.default_rng(6)
-    rgb = photos(points, ~outside(points, 90.0, 110.0), 700.0, rng)[:, ::4, ::4]
-    assert not find_table_edges(rgb, everywhere(rgb), points[::4, ::4], EYE)
-
-
 def test_no_ground_and_no_shadow_is_seen_beyond_the_edge_and_the_object_before_it_is_whole():
     points, rng = table_points(), np.random.default_rng(4)
     beyond = outside(points, 90.0, 60.0)
@@ -121,11 +98,3 @@ def test_no_ground_and_no_shadow_is_seen_beyond_the_edge_and_the_object_before_i
     assert (ball & beyond).sum() > 30, "the ball is seen before the floor"
     assert (shadows.object_mask & ball).sum() / (shadows.object_mask | ball).sum() > 0.85
     assert not (shadows.likelihood < GROUND_LIKE)[beyond & (np.roll(beyond, -3, 0))].any()
-
-
-def test_a_point_above_the_horizon_is_on_no_table():
-    points = table_points()
-    beyond = outside(points, 90.0, 110.0)
-    rgb = photos(points, ~beyond, 700.0, np.random.default_rng(5))
-    edges = find_table_edges(rgb, everywhere(rgb), points, EYE)
-    assert not on_table(edges, np.full((1, 3), np.nan)).any() and on_table((), points).all()

@@ -4,7 +4,6 @@ import io
 import signal
 import subprocess
 import sys
-import threading
 from itertools import pairwise
 from pathlib import Path
 
@@ -72,14 +71,6 @@ def test_no_more_than_the_promised_time_passes_without_a_line_however_steps_and_
     assert any("reading shadows" in line for line in screen.lines())
 
 
-def test_a_run_that_waits_for_a_visitor_is_silent():
-    screen = Screen()
-    screen.display(step(5, "paused"))
-    screen.display.activity("")
-    screen.wait(60)
-    assert screen.lines() == ["Fitting the surface: 5 of 60, paused"]
-
-
 def test_a_run_says_soon_what_it_opens_and_a_quick_refusal_stands_alone():
     screen = Screen()
     with screen.display.beating("opening capture"):
@@ -87,16 +78,6 @@ def test_a_run_says_soon_what_it_opens_and_a_quick_refusal_stands_alone():
         assert screen.lines() == []
         screen.wait(0.25)
         assert screen.lines() == ["opening capture, 1 s so far"]
-
-
-def test_it_beats_by_itself_while_the_block_runs_and_no_longer():
-    screen, beaten = Screen(), threading.Event()
-    screen.display.beat = beaten.set
-    with screen.display.beating("opening capture"):
-        assert beaten.wait(60)
-        names = [thread for thread in threading.enumerate() if thread.name == "heartbeat"]
-        assert len(names) == 1
-    assert not names[0].is_alive()
 
 
 @pytest.mark.parametrize("sentence", ["reading shadows", ""])

@@ -1,7 +1,5 @@
 """Truth: the balls' own normals and colours, against what a shader would make of the baked pictures."""
 
-from dataclasses import replace
-
 import fake_run
 import numpy as np
 import pytest
@@ -79,17 +77,6 @@ def test_the_base_is_flat_and_looks_down(baked):
     assert (shaded[base, 2] < -0.99).all()
 
 
-def test_texture_coordinates_stay_in_the_picture_and_do_not_overlap(baked):
-    assert baked.uv.min() >= 0 and baked.uv.max() <= 1
-    corners = baked.uv[baked.faces]
-    sides = corners[:, 1:] - corners[:, :1]
-    assert 0.3 < np.abs(np.linalg.det(sides)).sum() / 2 < 1.0
-
-
-def test_colours_reach_beyond_the_charts(baked):
-    assert (baked.base.reshape(-1, 3) > 0).all()  # nothing in the scene is black
-
-
 def test_tangents_follow_the_picture():
     """A square in the xz plane seen from -y, its picture upright: u along +x, up along +z."""
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]])
@@ -101,8 +88,3 @@ def test_tangents_follow_the_picture():
     assert np.allclose(np.cross(normals, tangents[:, :3]) * tangents[:, 3:], [0, 0, 1])
     mirrored = vertex_tangents(vertices, normals, uv * [-1, 1] + [1, 0], faces)
     assert np.allclose(mirrored, [-1, 0, 0, -1])
-
-
-def test_a_scene_that_no_photo_saw_is_baked_too(fields, full):
-    dark = replace(fields, albedo=torch.zeros_like(fields.albedo))
-    assert not bake(dark, simplified(full, 500), full, 64).base.any()

@@ -1,6 +1,5 @@
 """The title that a person typed is the title everywhere: cards, results, reports, pages to send, names of files."""
 
-import os
 from pathlib import Path
 from urllib.parse import quote
 
@@ -79,28 +78,10 @@ def test_a_file_to_download_is_called_as_its_run_is_now(finished_run, tmp_path):
             assert quote(f"{as_name(title, '')}.off") in told or f'"{title}.off"' in told
 
 
-def test_runs_follow_their_capture_when_it_is_renamed_unless_they_were_renamed(tmp_path):
-    (tmp_path / "captures" / "vase" / "photos").mkdir(parents=True)
-    for name in ("vase-draft", "vase-fine"):
-        keep_title(run_in(tmp_path, name), "vase" if name == "vase-draft" else "The fine one")
-    with served(tmp_path) as (_, _, owner):
-        owner.ok("rename", key="captures/vase", title="Blue")
-        (card,) = owner.get("/api/state")[1]["cards"]
-    assert card["title"] == "Blue" and {row["title"] for row in card["runs"]} == {"Blue", "The fine one"}
-
-
 @pytest.mark.parametrize("content", [b"", b" \n\t ", b"\x00\x07", b"x" * 100_000, b"\xff\xfe"])
 def test_a_strangers_title_is_a_line_of_text_or_none(tmp_path, content):
     (tmp_path / TITLE).write_bytes(content)
     assert title_of(tmp_path) in (tmp_path.name, "\ufffd\ufffd")
-
-
-def test_a_strangers_title_leads_nowhere(tmp_path):
-    (tmp_path / TITLE).symlink_to("/etc/passwd")
-    assert title_of(tmp_path) == tmp_path.name
-    (tmp_path / TITLE).unlink()
-    os.mkfifo(tmp_path / TITLE)
-    assert title_of(tmp_path) == tmp_path.name
 
 
 @pytest.mark.parametrize("title", ["", "  ", "\n\t", "\ud800"])

@@ -6,10 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import binary_dilation
 from synthetic import Look, Sphere, render
 from test_end_to_end import write_scene
-from torch.utils._python_dispatch import TorchDispatchMode
 
 import shadowgraph
 from capture.errors import ReconstructionError
@@ -174,44 +172,6 @@ def test_every_ablation_changes_how_the_shadows_pull_at_the_surface(name, shadow
     assert (other - pull).norm() > 0.01 * pull.norm()
     moves_no_start = name == "intersection"  # the same rays, of which only the gradient leaves a part out
     assert (after == before) == moves_no_start
-
-
-@pytest.mark.parametrize("name", ["foreground-only", "background-only"])
-def test_shadows_beside_the_ones_that_count_may_say_what_they_like(name, shadows, frame):
-    scene, truth = shadows
-    config = ablated(replace(TINY, pixels=200), name)
-    far = ~binary_dilation(truth.mask, iterations=5)  # the trainer counts the object's rim as object
-    found = []
-    for part in (np.zeros_like(far), truth.mask, far):
-        told = replace(scene, shadow=torch.where(torch.from_numpy(part), 1 - scene.shadow, scene.shadow))
-        found.append(shadow_pull(config, make_train_pixels(told, frame, 1, torch.device("cpu")), frame)[0])
-    honest, object_lies, ground_lies = found
-    assert (object_lies != honest) == (name == "foreground-only")
-    assert (ground_lies != honest) == (name == "background-only")
-
-
-class NoDoubles(TorchDispatchMode):
-    """Fails on any operation that gives double precision: MPS has none."""
-
-    def __torch_dispatch__(self, function, types, arguments=(), named=None):
-        out = function(*arguments, **(named or {}))
-        assert getattr(out, "dtype", None) != torch.float64, function
-        return out
-
-
-@pytest.mark.parametrize("field", ["neural", "hash", "grid"])
-def test_an_iteration_needs_no_double_precision(field, shadows, frame):
-    scene, _ = shadows
-    config = replace(TINY, field=field)
-    model = Model(config, unit_height(0.0, frame))
-    view = make_train_pixels(scene, frame, 1, torch.device("cpu"))
-    with NoDoubles():
-        torch.stack(list(losses(model, view, config, 3, torch.Generator()).values())).sum().backward()
-
-
-def test_small_pictures_are_not_reduced_further(shadows, frame):
-    scene, _ = shadows
-    assert make_train_pixels(scene, frame, 8, torch.device("cpu")).directions.shape == (64 * 48, 3)
 
 
 def test_an_assumed_ground_is_not_held_to_its_plane(shadows, frame):

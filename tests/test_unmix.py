@@ -40,13 +40,6 @@ def test_an_outline_drawn_a_pixel_too_wide_moves_back():
     assert torch.equal(mask[12:18] > 0.5, covered[12:18] > 0.5)
 
 
-def test_shadow_edges_that_run_past_do_not_change_the_coverage():
-    covered, photos = square()
-    photos[: N_PHOTOS // 3, :, 22:24] *= 0.05  # in a third of the photos the ground beside is in shadow, further on lit
-    mask = coverage_at_edges(photos[..., None], covered > 0.5)
-    assert torch.allclose(mask[12:18, 20:23], covered[12:18, 20:23], atol=0.05)
-
-
 @pytest.mark.slow
 def test_a_round_object_is_covered_as_far_as_its_outline():
     scene, truth = render((BALL,), Look(width=480, height=360, n_lights=20))
@@ -59,9 +52,3 @@ def test_a_round_object_is_covered_as_far_as_its_outline():
     error = (found - true)[edge]
     assert abs(float(error.mean())) < 0.05 and float(error.abs().median()) < 0.03
     assert ((found > 0.5) != (true > 0.5)).sum() <= 0.1 * edge.sum()
-
-
-def test_nothing_and_everything_have_no_outline():
-    photos = torch.rand(3, 8, 8)
-    assert coverage_at_edges(photos[..., None], torch.zeros(8, 8, dtype=torch.bool)).max() == 0
-    assert coverage_at_edges(photos[..., None], torch.ones(8, 8, dtype=torch.bool)).min() == 1

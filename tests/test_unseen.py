@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from synthetic import Box, Look, Sphere, render
 
-from reconstruct.hull.shadow_hull import shadow_hull
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import supervise
 from reconstruct.sdf.grid import SdfGrid
@@ -65,20 +64,6 @@ def test_a_lump_behind_the_object_goes_and_the_object_stays():
     assert inside(found, CRATE) > 0.99
 
 
-def excess(grid: SdfGrid, truth) -> int:
-    """Nodes of matter that are well outside of the true surface."""
-    at = np.stack(np.meshgrid(*(grid.spacing * np.arange(n) for n in grid.values.shape), indexing="ij"), -1)
-    at = at + grid.origin.numpy()
-    true = truth.sdf(at.reshape(-1, 3)).reshape(grid.values.shape)
-    return int(((grid.values.numpy() < 0) & (true > 2 * grid.spacing) & (at[..., 2] > 0)).sum())
-
-
-def test_matter_that_reaches_up_to_lit_rays_and_to_the_camera_s_line_over_an_edge_goes_as_well():
-    scene, truth, rays = shadows((CRATE,))
-    hull = shadow_hull(scene, assemble_labels(scene, None, None), 2, 44)
-    assert excess(without_unsupported_matter(hull, scene, rays), truth) < 0.85 * excess(hull, truth)
-
-
 def test_thin_legs_stay_because_their_shadows_need_them():
     scene, truth, rays = shadows(TABLE)
     true = truth.sdf(nodes().reshape(-1, 3)).reshape(COUNTS)
@@ -114,11 +99,3 @@ def test_no_dark_ray_that_was_blocked_comes_free():
         for grid in (start, found)
     )
     assert still[blocked].mean() > 0.999
-
-
-def test_a_wall_of_the_box_close_behind_the_object_attracts_no_matter():
-    scene, truth, rays = shadows((CRATE,))
-    true = truth.sdf(nodes().reshape(-1, 3)).reshape(COUNTS)[:, :29]  # the last nodes lie 4 mm behind the crate
-    start = SdfGrid(torch.from_numpy(np.ascontiguousarray(true)).float(), torch.from_numpy(ORIGIN).float(), SPACING)
-    found = without_unsupported_matter(start, scene, rays).values.numpy()
-    assert not ((found < 0) & (true > SPACING) & (nodes()[:, :29, :, 2] > 0)).any()

@@ -11,7 +11,7 @@ from capture.decode import sandbox as confined
 from capture.decode.formats import read_size
 from capture.decode.video import frames_of, read_clip, read_frame
 from capture.errors import CaptureError
-from capture.files.names import clip_of, frame_path, is_clip_name, stored_file
+from capture.files.names import frame_path
 from capture.photos.photo import read_photo, read_stack, read_thumbnail
 from reconstruct.run_folder.folder import content_hash
 
@@ -40,16 +40,6 @@ def shown(picture: np.ndarray) -> float:
     return float(picture[120:160, 150:200].mean())
 
 
-def test_the_name_of_a_frame_says_clip_and_time_and_has_a_stem_of_its_own():
-    one, other = (frame_path(Path("photos/my clip.v2.MOV"), t) for t in (12.3456, 12.5))
-    assert one.name == "my clip.v2#t=12.346s.MOV" and one.stem != other.stem
-    assert clip_of(one) == (Path("photos/my clip.v2.MOV"), 12.346)
-    assert stored_file(one) == Path("photos/my clip.v2.MOV")
-    for plain in (Path("a.mov"), Path("a#t=1.000s.jpg"), Path("a#t=x.mov")):
-        assert clip_of(plain) is None and stored_file(plain) == plain
-    assert is_clip_name(one) and not is_clip_name(Path("._a.mov"))
-
-
 @pytest.mark.parametrize(
     ("suffix", "fourcc"), [(".mp4", "mp4v"), (".mov", "MJPG"), (".mkv", "mp4v"), (".webm", "VP80"), (".avi", "MJPG")]
 )
@@ -59,16 +49,6 @@ def test_a_frame_is_found_by_its_time_in_every_container(tmp_path, suffix, fourc
     assert times == pytest.approx(np.arange(N_FRAMES) / FPS, abs=2e-3)  # webm and mkv count milliseconds
     for i in (0, 7, 33, N_FRAMES - 1):
         assert shown(read_frame(path, round(times[i], 3))) == pytest.approx(grey(i), abs=CODED)
-
-
-def test_frames_of_a_variable_frame_rate_keep_their_own_times(tmp_path):
-    path = clips.slow_down_second_half(write_counting(tmp_path / "clip.mp4"), 5)
-    frames = [(time_s, shown(frame)) for time_s, frame in frames_of(path, 0.0)]
-    assert [value for _, value in frames] == pytest.approx([grey(i) for i in range(N_FRAMES)], abs=CODED)
-    expected = np.cumsum([0, *[1 / FPS] * (N_FRAMES // 2), *[5 / FPS] * (N_FRAMES // 2 - 1)])
-    assert [t for t, _ in frames] == pytest.approx(expected, abs=1e-3)
-    for i in (3, 29, 30, 31, 47, N_FRAMES - 1):
-        assert shown(read_frame(path, round(frames[i][0], 3))) == pytest.approx(grey(i), abs=CODED)
 
 
 def test_the_rotation_in_the_container_is_left_alone(tmp_path):
@@ -109,10 +89,6 @@ def test_an_hdr_clip_is_refused_with_what_to_do(tmp_path, transfer):
     path = clips.declare_transfer(write_counting(tmp_path / "clip.mp4"), transfer)
     with pytest.raises(CaptureError, match=r"HDR clip .* Switch HDR video off"):
         read_clip(path)
-
-
-def test_a_clip_that_declares_ordinary_video_is_read(tmp_path):
-    assert read_clip(clips.declare_transfer(write_counting(tmp_path / "clip.mp4"), 1)).width == 320
 
 
 @pytest.mark.parametrize("content", [b"", b"not a clip at all", None])
@@ -167,13 +143,6 @@ def test_phone_codecs_with_ten_bits_and_uneven_times_are_read_frame_by_frame(tmp
     assert shown(read_frame(path, 0.54)) == pytest.approx(grey(5), abs=CODED)
 
 
-def test_a_turned_hevc_clip_stays_in_the_frame_of_the_sensor(tmp_path):
-    path = clips.turn_in_container(encode(tmp_path / "hevc.mp4", "libx265", "yuv420p", X265))
-    clip = read_clip(path)
-    assert (clip.width, clip.height) == (lit_table.WIDTH, lit_table.HEIGHT)
-    assert read_frame(path, 0.0)[:, :50].mean() < 30  # the stripe is still on the left
-
-
 @pytest.mark.parametrize(("name", "transfer"), [("hlg.mov", 18), ("pq.mkv", 16)])
 def test_hdr_from_an_encoder_is_refused(tmp_path, name, transfer):
     path = encode(tmp_path / name, "libx265", "yuv420p10le", X265, transfer)
@@ -191,16 +160,6 @@ def test_codecs_that_no_camera_films_in_are_refused_before_they_decode(tmp_path,
     with pytest.raises(CaptureError, match=rf"{name} is compressed with .*H\.264 or HEVC"):
         list(frames_of(path, 0.0))
     assert not decoded
-
-
-def test_containers_that_no_camera_writes_are_refused_whatever_their_name_says(tmp_path):
-    path = encode(tmp_path / "clip.nut", "mpeg4", "yuv420p", {}).rename(tmp_path / "clip.mp4")
-    with pytest.raises(CaptureError, match=r"clip\.mp4 is no clip that can be decoded"):
-        read_clip(path)
-
-
-def test_prores_of_a_phone_is_read(tmp_path):
-    assert len(list(frames_of(encode(tmp_path / "clip.mov", "prores_ks", "yuv422p10le", {}), 0.0))) == len(UNEVEN)
 
 
 def test_a_clip_whose_frames_cannot_be_decoded_is_refused_with_its_codec(tmp_path, monkeypatch):

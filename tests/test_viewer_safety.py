@@ -2,12 +2,10 @@
 
 import asyncio
 import gc
-import gzip
 import hmac
 import http.client
 import inspect
 import itertools
-import random
 import socket
 import struct
 import time
@@ -119,13 +117,6 @@ def test_the_page_listens_on_this_machine_alone_unless_asked(server):
     ]
     assert bound == ["127.0.0.1"]
     assert is_loopback("localhost") and is_loopback("::1") and is_loopback("127.0.0.9") and not is_loopback("0.0.0.0")
-
-
-def test_the_page_itself_may_connect_also_through_an_ssh_tunnel(server):
-    port = server.get_port()
-    assert get(port).status == 200
-    assert talk(port) == 101
-    assert get(port, Host="localhost:9999", Origin="http://localhost:9999").status == 200
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", None, "http://localhost:3000", "http://127.0.0.1"])
@@ -292,37 +283,6 @@ def test_a_client_cannot_open_the_public_share_tunnel_while_one_of_two_guards_st
 # --- what a page may send --------------------------------------------------------------------------------------------
 
 
-def nonsense(random_numbers: random.Random) -> bytes | str:
-    """One of many kinds of frame that our page never sends."""
-    some = random_numbers.randbytes(random_numbers.randrange(200))
-    return random_numbers.choice(
-        [
-            some,
-            b"",
-            some.hex(),
-            b"\x90" * 1000,
-            b"\x81" * 5000,
-            b"\xdd\xff\xff\xff\xff",
-            b"\xc6\xff\xff\xff\xff" + some,
-            msgspec.msgpack.encode({"type": "NoSuchMessage"}),
-            msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "x"}),
-            msgspec.msgpack.encode({"type": 7}),
-            msgspec.msgpack.encode({"type": "ViewerCameraMessage", "padding": b"0" * 2 * message_filter.LARGEST}),
-        ]
-    )
-
-
-@pytest.mark.slow
-def test_ten_thousand_malformed_frames_leave_the_server_alive_and_its_memory_bounded(server):
-    random_numbers, before = random.Random(5), psutil.Process().memory_info().rss
-    for _ in range(FRAMES // FRAMES_AT_ONCE):
-        frames = [nonsense(random_numbers) for _ in range(FRAMES_AT_ONCE)]
-        assert talk(server.get_port(), *frames, raw=True, taken=only_closed) in (REFUSED, 1006)
-    assert talk(server.get_port()) == 101
-    assert psutil.Process().memory_info().rss - before < 60e6
-    wait_until(lambda: not server.get_clients())
-
-
 def test_a_frame_that_says_it_is_huge_is_refused_before_it_is_read(server):
     with socket.create_connection(("127.0.0.1", server.get_port()), timeout=PATIENCE_S) as tcp:
         host = f"127.0.0.1:{server.get_port()}"
@@ -399,15 +359,6 @@ def test_a_message_changes_the_value_of_a_control_and_nothing_else_about_it(monk
         slider._impl.parent_container_id = "root"  # so that the server can be taken down
 
 
-def test_pages_that_come_and_go_leave_nothing_behind(server):
-    talk(server.get_port())
-    before = psutil.Process().memory_info().rss
-    for _ in range(60):
-        assert talk(server.get_port()) == 101
-    assert psutil.Process().memory_info().rss - before < 30e6
-    wait_until(lambda: not server.get_clients())
-
-
 def break_off(port: int) -> None:
     """Come as a page does, and leave with an error."""
 
@@ -436,14 +387,3 @@ def test_a_visitor_who_breaks_off_is_let_go_when_memory_is_given_back(server):
         wait_until(is_let_go)
     finally:
         gc.enable()
-
-
-def test_the_page_has_the_name_of_the_run_and_no_white_ground(tmp_path):
-    named = GuardedServer("127.0.0.1", ANY_PORT, title="a <run>")
-    for coding in ("identity", "gzip"):
-        connection = http.client.HTTPConnection("127.0.0.1", named.get_port(), timeout=PATIENCE_S)
-        connection.request("GET", "/", headers={"Connection": "close", "Accept-Encoding": coding})
-        body = connection.getresponse().read()
-        text = (gzip.decompress(body) if coding == "gzip" else body).decode()
-        assert "<title>a &lt;run&gt;</title>" in text and "background:#141517" in text
-    named.stop()

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import dblquad
 
 from calibration.flashlight import wall as walls
-from calibration.flashlight.fit import first_fits, fit_flashlights
+from calibration.flashlight.fit import fit_flashlights
 from calibration.flashlight.model import (
     PER_FLASHLIGHT,
     Evidence,
@@ -91,16 +91,6 @@ def test_a_wall_keeps_lights_in_place_that_move_without_its_light(azimuth, dista
     assert off(truth, evidence, truth) < 0.02
     monkeypatch.setattr(walls, "LARGEST_STEP", 0.0)
     assert off(replace(truth, wall=walls.NO_WALL), evidence, truth) > off(truth, evidence, truth)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("azimuth", "distance"), PLACES)
-def test_lights_beside_a_wall_are_found_nearer_than_without_its_light(azimuth, distance, monkeypatch):
-    evidence, truth = ground(14, 2, (azimuth, np.log(distance), 0.6))
-    found = off(first_fits(evidence).best(), evidence, truth)
-    monkeypatch.setattr(walls, "LARGEST_STEP", 0.0)
-    monkeypatch.setattr("calibration.flashlight.fit.with_wall", lambda state, *_: state)
-    assert off(first_fits(evidence).best(), evidence, truth) > 1.1 * found
 
 
 def off(start: Flashlights, evidence: Evidence, truth: Flashlights) -> float:
