@@ -25,7 +25,7 @@ from calibration.posed_camera import PosedCamera
 from calibration.reframed import reframed, with_doubt
 from calibration.side_photos.side_views import metric_cues, side_notes
 from capture.checks.ambient_light import find_shadows
-from capture.errors import CalibrationError
+from capture.errors import CalibrationError, Remedy
 from capture.files.names import clip_of
 from capture.photos.finding import Finding, grouped
 from capture.photos.photo import PhotoStack, read_photo
@@ -65,10 +65,9 @@ def calibrate(
     cues, sides = metric_cues(session, stack, usable, posed_camera, board, lens.on_sheet)
     declared = session.settings.declared
     if declared.lights_at_once > 1:
-        raise CalibrationError(
-            f"{session.folder}: session.toml declares {declared.lights_at_once} lights at once, which the ground's "
-            "shading cannot separate; their positions are needed. Give a file with a line for each: --lights FILE."
-        )
+        at_once = f"{session.folder}: session.toml declares {declared.lights_at_once} lights at once"
+        wanted = "which the ground's shading cannot separate; their positions are needed, a line for each."
+        raise CalibrationError(f"{at_once}, {wanted}", Remedy.LIGHTS_FILE)
     mixtures: list[str] = []
     if declared.light_kind == "sun":
         fit = locate_sun(stack, posed_camera, usable, declared.solids)

@@ -18,7 +18,7 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.checks.framing import NOT_COMPARED, NOT_SHOWN, REFRAMED, SEEN_FROM, ZOOM_STATED
-from capture.errors import CalibrationError
+from capture.errors import CalibrationError, Remedy
 from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
 
@@ -144,8 +144,9 @@ def _seen_from(posed_camera: PosedCamera, homography: Float[np.ndarray, "3 3"], 
             return replace(posed_camera, world_from_camera=pose)
     raise CalibrationError(
         f"{told.photo.name} and the others do not show the view of the board's photo, and where they were taken from "
-        "cannot be told from the table's texture. Photograph the board from the tripod's place, with nothing moved "
-        "since, and put that photo into board/."
+        "cannot be told from the table's texture. A photo of the board from the tripod's place, with nothing moved "
+        "since, was needed.",
+        Remedy.BOARD_PHOTO,
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from capture.errors import ReconstructionError
+from capture.errors import ReconstructionError, Remedy
 from reconstruct.scene import Scene, carried_lights
 
 SAME_GROUND = 1e-3  # of the cameras' height: one ground for all
@@ -92,5 +92,7 @@ def check_common(scenes: Scenes) -> None:
     if len(scenes) > 1 and not all(scene.ground_known and scene.ground_depth is None for scene in scenes):
         raise ReconstructionError(
             f"{len(scenes)} views on ground that is unknown or uneven; views are solved together on one known, level "
-            "ground. Give its height with --ground, or solve one view alone."
+            "ground.",
+            "solve one view alone",
+            Remedy.GROUND,
         )

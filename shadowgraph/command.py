@@ -185,7 +185,7 @@ def main(arguments: list[str] | None = None) -> int:
         with sigterm_as_ctrl_c():
             execute(command, Console())
     except KeyboardInterrupt as stop:
-        print("Stopped. The same command continues from here.", file=sys.stderr)
+        print("Stopped. Started again, it goes on from here.", file=sys.stderr)
         return 143 if isinstance(stop, Terminated) else 130
     except (UserError, OSError, MemoryError, RuntimeError) as error:
         sentence = None if command.debug else sentence_for(error)

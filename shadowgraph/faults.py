@@ -1,5 +1,6 @@
 """The ways in which a command can fail, and the sentence for each."""
 
+import os
 import signal
 import sys
 import threading
@@ -8,8 +9,21 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType, TracebackType
 
-from capture.errors import UserError
+from capture.errors import FOR_STUDIO, Remedy, UserError
 from capture.files.names import in_one_line
+from viewer.studio.words import in_page_words
+
+OPTIONS = {
+    Remedy.NAME_BOARD: "--board",
+    Remedy.BOARD_PHOTO: 'or session.toml: roles = { board = ["NAME.jpg"] }',
+    Remedy.LIGHTS_FILE: "--lights FILE.lp",
+    Remedy.GROUND: "--ground HEIGHT",
+    Remedy.COARSER: "--preset draft",
+    Remedy.OTHER_SEED: "--seed 1",
+    Remedy.START_AGAIN: "--force",
+    Remedy.OTHER_FOLDER: "--out",
+    Remedy.PACK_FAULT: "--debug shows more",
+}
 
 
 class Terminated(KeyboardInterrupt):
@@ -45,28 +59,30 @@ def say_fault(kind: type[BaseException], error: BaseException, trace: TracebackT
         trace = trace.tb_next
     where = f" ({Path(trace.tb_frame.f_code.co_filename).name}, line {trace.tb_lineno})" if trace else ""
     said = in_one_line(f"{kind.__name__}: {error}{where}")
-    sys.stderr.write(
-        f"shadowgraph: a fault of the program: {said}. --debug shows more; `shadowgraph "
-        "report RUN --bundle fault.zip` packs what a bug report needs. The same command continues from here.\n"
-    )
+    fault = UserError(f"a fault of the program: {said}. Started again, it goes on from here.", Remedy.PACK_FAULT)
+    sys.stderr.write(f"shadowgraph: {sentence_for(fault)}\n")
+
+
+def _in_words(error: UserError) -> str:
+    """Return the text of an error with what to do as options, or as buttons of the studio that started this process."""
+    if os.environ.get(FOR_STUDIO) == "1":
+        return in_page_words(error)
+    return error.worded(lambda one: f"{one.value} ({OPTIONS[one]})" if one in OPTIONS else one.value)
 
 
 def sentence_for(error: Exception) -> str | None:
     """Say in one sentence what is wrong with the input or the machine; None: it is a fault of the program."""
     if isinstance(error, UserError):  # which may quote a stranger's file: nothing in it commands the terminal
-        return in_one_line(str(error))
+        return in_one_line(_in_words(error))
     if isinstance(error, OSError):  # no room, no right to write, a drive that went away
         return (
             f"{error.filename or 'a file'}: {error.strerror or error}. Check that the place can be written to and has "
-            "room; the same command continues from here."
+            "room; started again, it goes on from here."
         )
     if isinstance(error, RecursionError):
         return "a file that was read is nested without end, which none of ours is. Make the result again."
     if _is_out_of_memory(error):
         said = (str(error) or "nothing left").splitlines()[0]
-        return (
-            f"the memory of this machine is used up ({said}). "
-            "Close other programs, or use --preset draft with --force; `shadowgraph doctor` says what runs need. The "
-            "same command continues from here."
-        )
+        found = f"the memory of this machine is used up ({said}). Started again, it goes on from here."
+        return _in_words(UserError(found, "close other programs", Remedy.COARSER))
     return None

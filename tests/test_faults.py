@@ -98,7 +98,7 @@ def _fingerprint(file: Path) -> str:
 
 def test_a_term_that_no_photo_can_be_blamed_for_ends_the_solve_by_its_name(scene, monkeypatch, tmp_path):
     spoil(monkeypatch, "mask", float("nan"), times=10**6, photo=None)
-    with pytest.raises(ReconstructionError, match=r"mask gave no finite number, for the 5th time in a row; .*--seed 1"):
+    with pytest.raises(ReconstructionError, match=r"mask gave no finite number, for the 5th time.*another seed"):
         fit(scene, TINY, Stop(), tmp_path / "checkpoint.safetensors")
 
 
@@ -145,7 +145,7 @@ def test_sigterm_saves_the_last_rest_and_leaves_within_five_seconds(tmp_path):
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     assert spent - now.user - now.system < 5  # seconds on an idle core, whatever else runs here
-    assert process.returncode == 143 and error.strip() == "Stopped. The same command continues from here."
+    assert process.returncode == 143 and error.strip() == "Stopped. Started again, it goes on from here."
     assert (out / "checkpoint.safetensors").exists() and not (out / "lock").exists()
     lines = read_log(out / "log.jsonl")
     assert lines[-1]["message"] == "stopped: Terminated"

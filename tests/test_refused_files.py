@@ -10,8 +10,6 @@ from test_intake import jpeg
 from test_studio import capture_in
 from test_studio_browser import DESKTOP, PHONE, browser, opened  # noqa: F401  a fixture
 
-from viewer.studio.page_words import in_page_words
-
 
 def a_zip(**files: bytes) -> bytes:
     file = io.BytesIO()
@@ -46,18 +44,6 @@ def test_a_refused_file_is_said_without_the_servers_path_or_a_folder_that_the_se
     assert refused
     for one in refused:
         assert str(tmp_path) not in one["why"] and "from the folder" not in one["why"], one["why"]
-
-
-@pytest.mark.parametrize(
-    "said",
-    [
-        "a.jpg holds nothing; JPEG is needed. Remove it from the folder, or copy the photo again.",
-        "a.jpg is a folder or a device, a photo's file is needed. Remove it from the folder.",
-        "a.jpg, reduced, is 3 x 4; 9 each way are needed to recognise its content. Remove it from the folder.",
-    ],
-)
-def test_no_sentence_of_the_page_speaks_of_a_folder_to_remove_a_photo_from(said):
-    assert "from the folder" not in in_page_words(said) and in_page_words(said).endswith(".")
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])

@@ -53,7 +53,7 @@ def test_a_second_process_is_refused_in_one_sentence_that_names_the_first(tmp_pa
 def test_a_folder_that_cannot_be_made_is_refused_in_one_sentence(tmp_path):
     (tmp_path / "file").write_text("mine")
     with (
-        pytest.raises(UserError, match=r"file/out, cannot be made or written to .*--out"),
+        pytest.raises(UserError, match=r"file/out, cannot be made or written to .*another folder"),
         RunFolder(tmp_path / "file/out"),
     ):
         pass

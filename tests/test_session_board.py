@@ -62,6 +62,6 @@ def test_what_no_photo_tells_of_a_board_is_doubted(tmp_path):
     photo.save(tmp_path / "b.jpg", quality=95, exif=exif)
     one = Session(tmp_path, (tmp_path / "b.jpg",), (), (), (), SessionSettings())
     assumed, front = fit_board(one)[2]["warnings"]
-    assert "30 mm" in assumed and "--board" in assumed
+    assert "30 mm" in assumed and "name the board" in assumed
     assert "front camera" in front and "mirrored" in front
     assert len(fit_board(one, checker.spec())[2]["warnings"]) == 1

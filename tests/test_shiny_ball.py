@@ -70,7 +70,7 @@ def test_photos_with_a_ball_need_neither_board_nor_list(tmp_path, photographed, 
 
 def test_without_ball_board_and_list_it_is_said_what_would_do(tmp_path, photographed):
     write_capture(tmp_path, photographed, photographed.stack.rgb)
-    with pytest.raises(CaptureError, match=r"Without a board, .*--lights FILE\.lp.*shiny ball in the picture"):
+    with pytest.raises(CaptureError, match=r"Without a board, .*shiny ball in the picture.*give a file of lights"):
         open_source(tmp_path, RunOptions())
 
 

@@ -143,7 +143,7 @@ def test_where_memory_is_short_fewer_rays_go_at_once_and_the_result_is_the_same(
 
 def test_a_device_without_memory_for_the_fewest_rays_is_refused_with_what_to_do(shadows, monkeypatch):
     had = without_memory(monkeypatch, range(100))
-    with pytest.raises(ReconstructionError, match=r"no memory for 2048 rays at once.*--preset draft or --device cpu"):
+    with pytest.raises(ReconstructionError, match=r"no memory for 2048 rays at once.*on the CPU, or choose a coarser"):
         fit(shadows, SMALL, lambda **_: None, device=TORCH)
     assert had == [2**power for power in range(17, 10, -1)]
 

@@ -18,7 +18,7 @@ from calibration.board.sheet_edges import find_edges
 from calibration.posed_camera import PosedCamera
 from capture.decode.exif import front_lens, optics_of
 from capture.decode.formats import read_exif
-from capture.errors import CalibrationError
+from capture.errors import CalibrationError, Remedy
 from capture.photos.photo import read_photo
 from capture.session.session import Session
 
@@ -265,14 +265,14 @@ def _warnings(tripod: Path, board: AnyBoard, is_named: bool) -> list[str]:
     if not is_named and isinstance(board, Board):
         warnings.append(
             f"no board was named: its squares are taken to be {board.square_mm:g} mm wide, which no photo tells. If "
-            "not, every length is off by one factor, but not the shape. Measure a square and write it into --board"
+            "not, every length is off by one factor, but not the shape. Measure a square and name the board with it"
         )
     lens = front_lens(tripod)
     if lens is not None and isinstance(board, Board) and board.kind == "checkerboard":
         warnings.append(
             f"{tripod.name} is by a front camera (EXIF: {lens}), which many phones store mirrored, and a "
             "checkerboard looks the same in a mirror: the shape may be mirrored. Take photos with the rear camera, or "
-            "switch mirroring off and use a ChArUco board (shadowgraph board), which tells"
+            "switch mirroring off and print a ChArUco board, which tells"
         )
     return warnings
 
@@ -322,10 +322,10 @@ def _named_board(greys: list[Grey], spec: str | None, names: list[str]) -> tuple
         blank = any(find_edges(greys[0], each) is not None for each in BLANKS.values())
         is_seen = f" {names[0]} seems to show a blank sheet or card." if blank else ""
         raise CalibrationError(
-            f"no common board recognised in {len(greys)} photos ({', '.join(names[:3])}).{is_seen} Name it with "
-            "--board, such as checkerboard:9x6:24.25, or paper:A4 if it is a blank sheet, and keep it whole, flat and "
-            "in focus in the tripod's photo. Photos without a board need a file of lights (--lights FILE) or a shiny "
-            "ball in the picture."
+            f"no common board recognised in {len(greys)} photos ({', '.join(names[:3])}).{is_seen} It was needed "
+            "whole, flat and in focus in the tripod's photo, or a shiny ball in the place of a board.",
+            Remedy.NAME_BOARD,
+            Remedy.LIGHTS_FILE,
         )
     if guess.board.kind == "checkerboard" and is_mirrored(greys):
         raise _mirrored(names[0])
@@ -351,8 +351,9 @@ def _no_board(name: str, board: AnyBoard, greys: list[Grey]) -> CalibrationError
 
 def _no_photo(session: Session, board: AnyBoard) -> CalibrationError:
     if not session.lit:
-        return CalibrationError(f"no photo of the board in {session.folder}, 1 needed. Put one into its folder board/.")
+        return CalibrationError(f"no photo of the board in {session.folder}, 1 needed.", Remedy.BOARD_PHOTO)
     return CalibrationError(
         f"no photo of the board in {session.folder} and board {board.spec()} not found in those under the flashlight; "
-        "one photo in room light from the tripod's place was needed. Put it into its folder board/."
+        "one photo in room light from the tripod's place was needed.",
+        Remedy.BOARD_PHOTO,
     )

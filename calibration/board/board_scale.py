@@ -72,8 +72,8 @@ def scale_doubts(board: AnyBoard, away_mm: float, name: str, optics: Optics, mar
             doubts.append(
                 f"in {name} a marker is {marker_share:.2f} of a square wide, and {board.marker_mm:g} of "
                 f"{board.square_mm:g} mm is {stated:.2f}: one of the two is wrong. With markers of {board.marker_mm:g} "
-                f"mm a square has about {board.marker_mm / marker_share:.2g} mm. Measure a square and write it into "
-                "--board"
+                f"mm a square has about {board.marker_mm / marker_share:.2g} mm. Measure a square and name "
+                "the board with it"
             )
     return doubts
 
@@ -133,4 +133,4 @@ def _advice(board: AnyBoard, away_mm: float, name: str, optics: Optics) -> str:
     units = f" ({', '.join(fitting)})" if fitting else ""
     if not fitting and optics.focus_mm is not None:
         units = f" (squares of about {board.square_mm * optics.focus_mm / away_mm:.2g} mm would fit that focus)"
-    return f"The board's {board.square_mm:g} is read as millimetres{units}. Measure a square and write it into --board"
+    return f"The board's {board.square_mm:g} is read as millimetres{units}. Measure a square and name the board with it"

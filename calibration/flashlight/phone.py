@@ -218,7 +218,7 @@ def _phone_back(back: BackView | None, choice: Choice | None) -> dict[str, Any]:
 def _too_few(n_found: int, views: PhoneViews) -> CalibrationError:
     return CalibrationError(
         f"the board was found in {n_found} of {len(views.names)} photos of the flashlight's phone that match "
-        f"a lit photo, {MIN_VIEWS} needed. Leave the board on the table in that phone's view, or use --lights shading."
+        f"a lit photo, {MIN_VIEWS} needed. Leave the board on the table in its view, or leave these photos out."
     )
 
 

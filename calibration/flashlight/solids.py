@@ -20,7 +20,7 @@ from calibration.lights.ground_cells import ground_points
 from calibration.lights.power import with_power_per_photo
 from calibration.posed_camera import PosedCamera
 from capture.checks.robust import column_quantile
-from capture.errors import CalibrationError
+from capture.errors import CalibrationError, Remedy
 from capture.photos.channels import mean_of_channels
 from capture.photos.photo import PhotoStack
 from capture.session.declared_objects import Solid
@@ -71,8 +71,9 @@ def locate_sun(
     """
     if not solids:
         raise CalibrationError(
-            'session.toml says light = "sun" and declares no object; the direction comes from a shadow: declare a '
-            "[[pegs]] or [[cubes]] that stands on the table, or give the directions with --lights FILE."
+            'session.toml says light = "sun" and declares no object; the direction comes from a shadow.',
+            "declare a [[pegs]] or [[cubes]] that stands on the table",
+            Remedy.LIGHTS_FILE,
         )
     pixels = _around(stack, posed_camera, solids, _even_levels(stack))
     lights = []

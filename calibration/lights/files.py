@@ -162,7 +162,7 @@ def _by_name(lights: Sequence[Light], names: Sequence[str], photos: Sequence[str
     if missing:
         raise NoMatchError(
             f"{path} has no light for {len(missing)} of {len(photos)} photos ({missing[0]}, ...), one for each is "
-            "needed. Add them, or leave --lights out."
+            "needed. Add them, or leave the file out."
         )
     return tuple(replace(light, photo=photo) for photo in photos for light in by_name[bare(photo)])
 

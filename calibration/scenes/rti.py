@@ -10,7 +10,7 @@ from pathlib import Path
 from calibration.known_scene import KnownScene
 from calibration.lights.photo_lists import folders_of, photos_in
 from calibration.scenes.listed_lights import load_listed
-from capture.errors import CalibrationError
+from capture.errors import CalibrationError, Remedy
 
 
 class Rti:
@@ -34,8 +34,9 @@ class Rti:
         if len(lists) > 1:
             names = ", ".join(str(path.relative_to(folder)) for path in lists)
             raise CalibrationError(
-                f"{folder} holds {len(lists)} lists of lights ({names}), one was needed. Name one with --lights, or "
-                "remove the others."
+                f"{folder} holds {len(lists)} lists of lights ({names}), one was needed.",
+                "remove the others",
+                Remedy.LIGHTS_FILE,
             )
         return load_listed(folder, lists[0])
 

@@ -58,7 +58,7 @@ def format_of(path: Path) -> str:
     if clip_of(path):
         return "clip"
     if path.exists() and not path.is_file():
-        raise CaptureError(f"{path} is a folder or a device, a photo's file is needed. Remove it from the folder.")
+        raise CaptureError(f"{path} is a folder or a device, a photo's file is needed. Leave it out.")
     try:
         with path.open("rb") as file:
             start = file.read(32)
@@ -93,7 +93,7 @@ def _format_of_start(start: bytes, path: Path) -> str | None:
 def _unknown(path: Path, content: str) -> CaptureError:
     return CaptureError(
         f"{path} holds {content}; JPEG, PNG, TIFF, HEIC, AVIF, EXR or a camera's RAW is needed. "
-        "Remove it from the folder, or copy the photo again."
+        "Copy the photo again, or leave it out."
     )
 
 

@@ -19,7 +19,7 @@ from jaxtyping import UInt8
 from capture.decode.heif import HDR_TRANSFERS
 from capture.decode.limits import broken
 from capture.decode.sandbox import Answer, Next, Task, decoding
-from capture.errors import CaptureError
+from capture.errors import CaptureError, Remedy
 
 Bgr = UInt8[np.ndarray, "height width 3"]
 
@@ -99,8 +99,8 @@ def read_frame(path: Path, time_s: float) -> UInt8[np.ndarray, "height width 3"]
         found = _frame(clip, answer)
     if found is None:
         raise CaptureError(
-            f"{path} has no frame at {time_s:.3f} s that can be decoded. Was the clip replaced? Give another --out, "
-            "so that its frames are chosen again."
+            f"{path} has no frame at {time_s:.3f} s that can be decoded. Was the clip replaced?",
+            Remedy.OTHER_FOLDER,
         )
     return cv2.cvtColor(found[1], cv2.COLOR_BGR2RGB)
 
@@ -109,7 +109,7 @@ def read_frame(path: Path, time_s: float) -> UInt8[np.ndarray, "height width 3"]
 def _opened(path: Path, task: Task, argument: float) -> Iterator[tuple[Clip, str, Next]]:
     """Yield the clip, its codec, and the function that returns the next frame."""
     if not path.is_file():
-        raise CaptureError(f"{path} is not there. Check the folder, or give another --out to choose its frames again.")
+        raise CaptureError(f"{path} is not there.", "put it back", Remedy.OTHER_FOLDER)
     _refuse_hdr(path)
     with decoding(task, path, argument) as answer:
         header = answer()

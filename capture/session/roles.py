@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.decode.exif import PhotoHeader, read_header
-from capture.errors import CaptureError
+from capture.errors import CaptureError, Remedy
 from capture.photos.channels import mean_of_channels
 from capture.photos.photo import decode_srgb, read_thumbnail
 
@@ -149,7 +149,7 @@ def features_of(path: Path) -> PhotoFeatures:
     if min(height, width) < TILE_PX:
         raise CaptureError(
             f"{path}, reduced to a length of {THUMBNAIL_PX} pixels at most, is {width} x {height}; {TILE_PX} each way "
-            "are needed to recognise its content. Remove it from the folder."
+            "are needed to recognise its content. Leave it out."
         )
     brightness = mean_of_channels(decode_srgb(thumbnail))
     cells = cells_of(brightness)
@@ -227,8 +227,8 @@ def _room_lit(fixed: Sequence[PhotoFeatures], n_photos: int) -> list[PhotoFeatur
     if not even or len(even) > len(fixed) // 2:
         raise NoBoardError(
             f"{len(fixed)} of the {n_photos} photos in {fixed[0].path.parent} show one view from a tripod; none "
-            "of them is recognised as the board in room light, one is needed. Put it into board/, or name it in "
-            'session.toml: roles = { board = ["NAME.jpg"] }.'
+            "of them is recognised as the board in room light, one is needed.",
+            Remedy.BOARD_PHOTO,
         )
     return sorted(even, key=lambda photo: -photo.evenness)
 

@@ -12,7 +12,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from capture.decode.formats import is_photo_name
-from capture.errors import CaptureError
+from capture.errors import CaptureError, Remedy
 from capture.files.names import is_clip_name, natural_order, refuse_no_folder, stored_file
 from capture.files.regular import why
 from capture.files.schema import Number, Positive, Text, Vector, as_type
@@ -354,8 +354,8 @@ def _refuse_too_few(roles: Roles, folder: Path, needs_board: bool, left_out: Seq
             f"{ADVISED_LIT} or more advised. {advice or _unread(folder) or _MORE_LIGHTS}"
         )
     if needs_board and not roles.board:
-        how = advice or _unread(folder) or "Photograph the board in room light and put the photo into board/."
-        raise NoBoardError(f"no photo of the board found in {folder}, one from the tripod's place is needed. {how}")
+        said = f"no photo of the board found in {folder}, one from the tripod's place and in room light is needed."
+        raise NoBoardError(" ".join(filter(None, [said, advice or _unread(folder)])), Remedy.BOARD_PHOTO)
 
 
 _MORE_LIGHTS = "Take more photos with the flashlight at other places."

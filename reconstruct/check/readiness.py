@@ -28,9 +28,7 @@ LARGEST_SIGMA = 0.06  # of a light's distance: lights that are off by more do no
 MANY_DROPPED, MANY_CUT = 0.25, 0.4  # of the photos
 LITTLE_GROUND, LITTLE_RING = 0.15, 0.5  # of the picture, of the ground near the object
 SMALLEST_OBJECT, LARGEST_OBJECT = 0.002, 0.6  # of the picture
-BOARD_AGAIN = (
-    "Photograph the board again as the tripod stands now, and put that photo into board/ in place of the other"
-)
+BOARD_AGAIN = "Photograph the board again as the tripod stands now, and use that photo in place of the other"
 GRADES = ("good", "fair", "poor", "hopeless")
 
 

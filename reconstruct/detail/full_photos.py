@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from capture.errors import CaptureError
+from capture.errors import CaptureError, Remedy
 from capture.files.atomic import TEMPORARY
 from capture.photos.photo import Photo, PhotoStack, gain_of, read_photo
 from reconstruct.detail.surface import Window
@@ -104,8 +104,9 @@ def _inside(
     height, width = photo.clipped.shape
     if (width, height) != size:
         raise CaptureError(
-            f"{photo.path} is {width} x {height} pixels, {size[0]} x {size[1]} was needed, as when it was calibrated. "
-            "Put the photos back as they were, or start again with --force."
+            f"{photo.path} is {width} x {height} pixels, {size[0]} x {size[1]} was needed, as when it was calibrated.",
+            "put the photos back as they were",
+            Remedy.START_AGAIN,
         )
     part = slice(window.top, window.top + window.height), slice(window.left, window.left + window.width)
     return photo.rgb[part].reshape(-1, CHANNELS)[index], photo.clipped[part].reshape(-1)[index]

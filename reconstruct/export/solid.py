@@ -100,7 +100,7 @@ def read_solid(run: StoredRun, path: Path) -> Contents:
     if not is_closed and not edit_of(run).cuts_guess:
         raise ReconstructionError(
             f"{path.name} reads back as {len(mesh.faces)} triangles that leave holes, and a closed surface was needed. "
-            "Export again with another number of --faces."
+            "Export again with another number of faces."
         )
     is_mm = run.unit == "mm"
     note = "millimetres, z up" if is_mm else "one unit of the scene is written as one millimetre, z up"

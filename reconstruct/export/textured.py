@@ -109,7 +109,7 @@ def read_textured(run: StoredRun, path: Path) -> Contents:
     if not bounds_a_solid(vertices, faces) and not edit_of(run).cuts_guess:
         raise ReconstructionError(
             f"{path.name} reads back as {len(faces)} triangles that leave holes, and a closed surface was needed. "
-            "Export again with another number of --faces."
+            "Export again with another number of faces."
         )
     in_metres = path.suffix.lower() != ".obj"
     extents = np.ptp(vertices, axis=0)[[0, 2, 1]] / (_to_metres(run.unit) if in_metres else 1.0)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from capture.errors import ReconstructionError
+from capture.errors import ReconstructionError, Remedy
 from reconstruct.config import FitConfig, Level
 from reconstruct.hull.bent_hull import JUDGES_BLOCK, JUDGES_SEED, JUDGES_SHARE, BentHull, Say
 from reconstruct.hull.follow_normals import follow_normals, normals_bias
@@ -335,5 +335,7 @@ def _refuse_few(scene: Scene) -> None:
         found = "photos under several lights at once" if is_shared(scene) else f"{len(scene.lights)} photos"
         raise ReconstructionError(
             f"{found} on an unknown ground; {FEWEST_LIGHTS} or more under one light each were needed, to read shape "
-            "from shading alone. Give the ground's height with --ground, or more photos."
+            "from shading alone.",
+            "take more photos",
+            Remedy.GROUND,
         )

@@ -70,8 +70,8 @@ class Contradictions:
             said.append(
                 f"lights contradict the others: {named}{more}. So much of the shadows on the ground cannot be cast by "
                 f"anything that the other photos leave ({100 * self.usual():.0f} % in the median photo). These lights "
-                "are probably off by some degrees: correct them, leave these photos out, or give --light-error 0.1, "
-                "which lets the lights move."
+                "are probably off by some degrees: correct them, leave these photos out, or state a larger error of "
+                "the lights, which lets them move."
             )
         if self.usual() >= MANY:
             said.append(

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from capture.errors import ReconstructionError
+from capture.errors import ReconstructionError, Remedy
 from reconstruct.labels.ground_test import GroundTest
 from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.scene import Scene, grey_irradiance, ground_points
@@ -34,8 +34,9 @@ def check_lights(scene: Scene) -> None:
     """
     if is_shared(scene) and scene.ground_depth is not None:
         raise ReconstructionError(
-            "photos under several lights at once need level ground, this ground is uneven. Take photos under one light "
-            "each, or give a plane with --ground HEIGHT."
+            "photos under several lights at once need level ground, this ground is uneven.",
+            "take photos under one light each",
+            Remedy.GROUND,
         )
     for rows in _groups(scene):
         if len(rows) > MOST_LIGHTS:

@@ -11,7 +11,7 @@ from scipy import ndimage
 from skimage.measure import marching_cubes
 from trimesh.visual import ColorVisuals
 
-from capture.errors import ReconstructionError
+from capture.errors import ReconstructionError, Remedy
 from capture.files.atomic import atomic_file
 from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.appearance.brdf import MetalRough, metal_rough
@@ -103,8 +103,9 @@ def surface_mesh(
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     if not (mesh.is_watertight and mesh.volume > 0):
         raise ReconstructionError(
-            f"the surface of {len(faces)} triangles is not closed, and a closed one was needed. "
-            "Please report this with the run folder; another --preset makes another grid."
+            f"the surface of {len(faces)} triangles is not closed, and a closed one was needed.",
+            "report this with the run folder",
+            Remedy.COARSER,
         )
     mesh.vertex_normals = _normals(grid, ground_height, mesh)
     return mesh
@@ -141,7 +142,8 @@ def _around_object(
     if nodes > max_nodes:
         raise ReconstructionError(
             f"the grid has {nodes / 1e6:.3g} million nodes around the object, at most {max_nodes / 1e6:.3g} million "
-            "fit in memory for the mesh. Choose a coarser --preset."
+            "fit in memory for the mesh.",
+            Remedy.COARSER,
         )
     window = tuple(slice(max(first - 1, 0), last + 2) for first, last in spans)
     walls = [(int(first == 0), int(last == n - 1)) for (first, last), n in zip(spans, layers.shape, strict=True)]

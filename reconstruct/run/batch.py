@@ -22,7 +22,7 @@ from msgspec import Meta, Struct
 
 from calibration.scenes.importers import IMPORTERS, OF_A_CAPTURE
 from capture.decode.formats import is_photo_name
-from capture.errors import CaptureError, UserError
+from capture.errors import FOR_STUDIO, CaptureError, Remedy, UserError
 from capture.files.atomic import read_json, write_json
 from capture.files.names import is_clip_name, refuse_no_folder
 from capture.files.schema import FileName, Number, Text, as_type
@@ -150,10 +150,10 @@ def start_task(task: Task, is_detached: bool = False) -> subprocess.Popen[bytes]
     """Start the run of a task in a process of its own, which writes what it says into `log_file`.
 
     Args:
-        is_detached: neither Ctrl-C nor the end of this process reaches it, and it gives way to what somebody waits for.
+        is_detached: neither Ctrl-C nor the end of this process reaches it; it is the studio's.
     """
     words = ["run", task.capture, "--out", str(Path(task.out) / task.name), "--viewer", "off", *task.options]
-    return start_command([*task.program, *words], log_file(task), task.threads, is_detached, gives_way=is_detached)
+    return start_command([*task.program, *words], log_file(task), task.threads, is_detached, for_studio=is_detached)
 
 
 def start_command(
@@ -162,19 +162,20 @@ def start_command(
     threads: int | None = None,
     is_detached: bool = False,
     speaks: bool = False,
-    gives_way: bool = False,
+    for_studio: bool = False,
 ) -> subprocess.Popen[bytes]:
     """Start one of our commands; what it says goes into `log`.
 
     Args:
         threads: that its kernels may use; all cores unless given.
         speaks: its stdin and stdout are pipes, and only its stderr goes into the log.
-        gives_way: to other programs, where the system has priorities: somebody waits for those meanwhile.
+        for_studio: its errors name the buttons of the page, and it gives way to other programs, where the system has
+            priorities: somebody waits for those meanwhile.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
     count = {} if threads is None else {"NUMBA_NUM_THREADS": str(threads), "OMP_NUM_THREADS": str(threads)}
-    environment = os.environ | count | {"PYTHONPATH": paths}
+    environment = os.environ | count | {"PYTHONPATH": paths, FOR_STUDIO: str(int(for_studio))}
     with log.open("wb") as file:
         process = subprocess.Popen(
             list(words),
@@ -184,7 +185,7 @@ def start_command(
             env=environment,
             start_new_session=is_detached,
         )
-    if gives_way and hasattr(os, "setpriority"):
+    if for_studio and hasattr(os, "setpriority"):
         with contextlib.suppress(OSError):  # it has ended already
             os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + GIVES_WAY)
     return process
@@ -207,11 +208,11 @@ def why_it_failed(code: int | None, log: Path) -> str:
     if code is not None and code < 0:
         name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
         hint = "; often the system's, for want of memory" if name == "SIGKILL" else ""
-        return f"ended by {name}{hint}. The same command continues it."
+        return f"ended by {name}{hint}. Started again, it goes on."
     lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     said = next((i for i in range(len(lines) - 1, -1, -1) if lines[i].startswith("shadowgraph: ")), None)
     if said is None and code is None:
-        return "ended without a word; often by the system, for want of memory. The same command continues it."
+        return "ended without a word; often by the system, for want of memory. Started again, it goes on."
     text = " ".join(lines[said:]) if said is not None else " ".join(lines[-SAID_LINES:])
     return text.removeprefix("shadowgraph: ") or f"ended with exit code {code} and said nothing"
 
@@ -274,7 +275,7 @@ def on_ray(tasks: Sequence[Task], address: str) -> Iterator[Outcome]:
 
 def _lost(task: Task, error: Exception) -> Outcome:
     """Return the outcome of a task that the cluster could not finish."""
-    sentence = f"the cluster lost it {RAY_RETRIES + 1} times ({type(error).__name__}). The same command continues it."
+    sentence = f"the cluster lost it {RAY_RETRIES + 1} times ({type(error).__name__}). Started again, it goes on."
     return Outcome(task.name, task.capture, task.options, 1, sentence, 0.0, time.time())
 
 
@@ -315,7 +316,7 @@ def load_outcomes(file: Path) -> dict[str, Outcome]:
         rows = [replace(row, report=checked_report(row.report, str(file))) for row in rows]
     except (OSError, UserError, ValueError) as error:
         raise CaptureError(
-            f"{file} is not the record of a batch ({error}). Move it away, or give another --out."
+            f"{file} is not the record of a batch ({error}).", "move it away", Remedy.OTHER_FOLDER
         ) from error
     return {row.name: row for row in rows}
 

@@ -36,7 +36,7 @@ class RequestSteering:
             return
         save()
         start = time.monotonic()
-        self._run.remark(f"{PAUSED}press Go on on the page, or start the same command again")
+        self._run.remark(f"{PAUSED}press Go on on the page, or start it again")
         self._run.activity("")
         while PAUSE in (asked := open_requests(self._run.path)) and STOP not in asked:
             time.sleep(LOOK_EVERY_S)
@@ -81,4 +81,4 @@ class RequestSteering:
     def _stop(self, how: str) -> None:
         self.was_stopped = True
         withdraw(self._run.path, STOP, PAUSE)
-        self._run.remark(f"{ON_REQUEST}{how}; the same command continues from here")
+        self._run.remark(f"{ON_REQUEST}{how}; started again, it goes on from here")

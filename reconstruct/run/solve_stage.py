@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
-from capture.errors import ReconstructionError
+from capture.errors import ReconstructionError, Remedy
 from capture.files.atomic import read_json
 from capture.files.regular import why
 from reconstruct.config import FitConfig
@@ -130,7 +130,7 @@ def schedule(options: RunOptions, run: RunFolder, source: Source) -> tuple[str, 
             return resolution, config_from_json(kept)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise ReconstructionError(
-            f"{path} holds no settings of a solver ({why(error)}). Give --force to start again, or another --out."
+            f"{path} holds no settings of a solver ({why(error)}).", Remedy.START_AGAIN, Remedy.OTHER_FOLDER
         ) from error
     config = solver_config(options)
     if options.time_budget is not None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from capture.errors import UserError
+from capture.errors import Remedy, UserError
 from capture.files.atomic import TEMPORARY, atomic_file, write_json
 from capture.files.names import stored_file
 from capture.files.regular import read_regular
@@ -106,15 +106,16 @@ class RunFolder:
 
     def __enter__(self) -> "RunFolder":
         if self.path.exists() and not self.path.is_dir():
-            raise UserError(f"{self.path} is a file, a folder was needed for the results. Give another --out.")
+            raise UserError(f"{self.path} is a file, a folder was needed for the results.", Remedy.OTHER_FOLDER)
         try:
             self._before = {p.name for p in self.path.iterdir()} if self.path.exists() else None
             self.path.mkdir(parents=True, exist_ok=True)
             take_lock(self.path)
         except OSError as error:
             raise UserError(
-                f"the folder for the results, {self.path}, cannot be made or written to ({error.strerror}). "
-                "Give another --out, or check permissions and free space."
+                f"the folder for the results, {self.path}, cannot be made or written to ({error.strerror}).",
+                "check permissions and free space",
+                Remedy.OTHER_FOLDER,
             ) from error
         try:
             self._read_what_is_there()
@@ -178,7 +179,9 @@ class RunFolder:
             if differences and not force:
                 raise UserError(
                     f"{self.path} holds a run with other settings ({'; '.join(differences)}), the same were needed to "
-                    "continue it. Give --force to start again there, or another --out."
+                    "continue it.",
+                    Remedy.START_AGAIN,
+                    Remedy.OTHER_FOLDER,
                 )
             if differences or force:
                 self._start_again()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import psutil
 
-from capture.errors import UserError
+from capture.errors import Remedy, UserError
 from capture.files.atomic import TEMPORARY, read_json
 
 try:
@@ -38,8 +38,10 @@ def take_lock(folder: Path) -> None:
                 _place(text, path)
                 return
     raise UserError(
-        f"{folder} is in use by another shadowgraph (process {lock_holder(path)}). "
-        "Wait until it has finished, end it, or give another --out."
+        f"{folder} is in use by another shadowgraph (process {lock_holder(path)}).",
+        "wait until it has finished",
+        "end it",
+        Remedy.OTHER_FOLDER,
     )
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from capture.errors import ReconstructionError
+from capture.errors import ReconstructionError, Remedy
 from reconstruct.fields import Fields, as_stored
 from reconstruct.labels.multiple_lights import is_shared
 from reconstruct.labels.observer import Observer
@@ -56,7 +56,7 @@ def train(
     if is_shared(scene):
         raise ReconstructionError(
             "a photo is lit by several lights at once, and a trained field compares each photo with one light. Use "
-            "--preset draft, standard or fine without --field."
+            "another preset without a field."
         )
     place = device or torch.device("cpu")
     frame = object_frame(scene, Observer(scene).ground_labels(), config.bound)
@@ -128,7 +128,9 @@ def iterations(
         if failures == MOST_FAILURES:
             raise ReconstructionError(
                 f"training has had no finite gradient for {failures} iterations, at iteration {i}; finite ones were "
-                "needed. Run again with another --seed; if that does not help, use the default field."
+                "needed.",
+                Remedy.OTHER_SEED,
+                "use the default field",
             )
         yield i, {name: float(term.detach()) for name, term in terms.items()}
 

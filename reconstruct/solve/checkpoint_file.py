@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from capture.errors import ReconstructionError
+from capture.errors import ReconstructionError, Remedy
 from capture.files.atomic import atomic_file
 from reconstruct.tensor_file import Layout, StoredTensors, read_tensors, write_tensors
 
@@ -106,5 +106,7 @@ def refuse_not_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
             bad = int((~tensor.isfinite()).sum())
             raise ReconstructionError(
                 f"{path.name}: {bad} of {tensor.numel()} values of '{name}' are not finite, finite ones were needed; "
-                "it was not written, and what was saved before is kept. Run the same command again, or with --seed 1."
+                "it was not written, and what was saved before is kept.",
+                "start it again",
+                Remedy.OTHER_SEED,
             )

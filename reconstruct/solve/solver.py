@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import torch
 
-from capture.errors import ReconstructionError
+from capture.errors import ReconstructionError, Remedy
 from reconstruct.config import FitConfig, Level
 from reconstruct.fields import Fields, as_stored
 from reconstruct.initialization.choose_start import HULL, Start, choose_start
@@ -311,8 +311,10 @@ def _without_faulty_photos(state: SolveState, fault: NotFiniteError, task: _Task
     names, left_out = photo_names(task.scenes), tuple(sorted({*state.left_out, *fault.photos}))
     if left_out == state.left_out or len(names) - len(left_out) < FEWEST_PHOTOS:
         raise ReconstructionError(
-            f"{fault}; finite numbers were needed. What was found before is kept: run the same command again, or with "
-            "--seed 1. If that does not help, the photos or their calibration hold such values."
+            f"{fault}; finite numbers were needed. What was found before is kept. If neither helps, the photos or "
+            "their calibration hold such values.",
+            "start it again",
+            Remedy.OTHER_SEED,
         ) from fault
     task.log(f"{fault}: back to the last checkpoint, without {', '.join(names[photo] for photo in fault.photos)}")
     return replace(state, left_out=left_out)
@@ -327,8 +329,10 @@ def _use_fewer_rays(fault: torch.OutOfMemoryError, task: _Task) -> None:
     had = BATCHES.rays
     if not BATCHES.halve():
         raise ReconstructionError(
-            f"the device has no memory for {had} rays at once, the fewest that are tried. What was found is kept: "
-            "close other programs that use the card, or choose --preset draft or --device cpu."
+            f"the device has no memory for {had} rays at once, the fewest that are tried. What was found is kept.",
+            "close other programs that use the card",
+            "compute on the CPU",
+            Remedy.COARSER,
         ) from fault
     task.log(f"no memory for {had} rays at once: back to the last checkpoint, with {BATCHES.rays}")
 

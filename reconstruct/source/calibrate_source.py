@@ -112,7 +112,7 @@ def with_ground(calibration: Calibration, option: str, is_known: bool, has_scale
     warning = (
         f"the ground is unknown: the surface is assumed to lie about {away:.4g}{unit} below the camera, "
         f"{'' if has_scale else 'the scale of the result is an assumption, and '}slow changes of depth over the "
-        "picture may be wrong, most of all under distant lights. Give the ground's height with --ground if you can"
+        "picture may be wrong, most of all under distant lights. Give the ground's height if you can"
     )
     warnings = [*calibration.residuals.get("warnings", []), warning]
     return replace(calibration, residuals=calibration.residuals | {"warnings": warnings})

@@ -28,7 +28,7 @@ MARGIN = 1.1  # of the prediction that must be available: its error is below a f
 MANY, ENOUGH = 100, 40  # photos: beyond MANY, lights lie so close that one more hardly shows a new shadow
 STEP = 0.95  # of photos or pixels at a time, until the rest fits
 SHORT = ". This machine may run out of it: close other programs, or give fewer photos"
-OVERRIDE = "--memory GB overrides this"
+OVERRIDE = "another memory limit changes this"
 TOO_MANY = "left out: so many photos do not fit into memory, and the lights of others are spread more evenly"
 
 

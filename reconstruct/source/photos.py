@@ -168,6 +168,6 @@ def _given_mask(known: KnownScene) -> Float[np.ndarray, "mask_height mask_width"
     if mask is not None and abs(mask.shape[1] * camera.height / (mask.shape[0] * camera.width) - 1) > SAME_SHAPE:
         raise CaptureError(
             f"{known.mask_path} is {mask.shape[1]} x {mask.shape[0]} pixels and the photos are {camera.width} x "
-            f"{camera.height}; the same shape was needed. Correct it, or leave it out with --mask none."
+            f"{camera.height}; the same shape was needed. Correct it, or leave it out."
         )
     return mask

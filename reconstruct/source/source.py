@@ -12,7 +12,7 @@ from calibration.scenes.ball_scene import load_with_ball
 from calibration.scenes.ground_depth import find_ground_depth
 from calibration.scenes.importers import find_importer
 from calibration.scenes.listed_lights import load_listed, why_unused
-from capture.errors import CaptureError, UserError
+from capture.errors import CaptureError, Remedy, UserError
 from capture.files.names import clip_of, refuse_no_folder
 from capture.photos.finding import Finding
 from capture.photos.photo import read_photo
@@ -37,8 +37,8 @@ DESCRIPTIONS = (
     "session.toml",
 )  # files that may describe a known scene
 WITHOUT_BOARD = (
-    "Without a board, the directions of the lights are missing: a file of lights (--lights FILE.lp) gives them, or a "
-    "shiny ball in the picture (none was found; session.toml may name it: ball = [x, y, radius], pixels)."
+    "Without a board, the directions of the lights are missing, which a shiny ball in the picture would tell (none was "
+    "found; session.toml may name it: ball = [x, y, radius], pixels)."
 )
 TRAINER_ABLATIONS = ("expected-depth", "sampled")  # the default solver has neither
 
@@ -185,7 +185,8 @@ def _opened(folder: Path, options: RunOptions, lights: Path | None) -> Source:
         if lights is None:
             known = load_with_ball(folder, None) if options.lights == WAYS[0] else None
             if known is None:
-                raise CaptureError(f"{no_capture} {WITHOUT_BOARD}{why_unused(folder)}") from None
+                said = f"{no_capture.found} {WITHOUT_BOARD}{why_unused(folder)}"
+                raise CaptureError(said, *no_capture.remedies, Remedy.LIGHTS_FILE) from None
             return Source(folder, known=known)
         try:
             known = load_listed(folder, lights)
@@ -259,10 +260,13 @@ def _check_uneven(folder: Path, known: KnownScene | None, options: RunOptions) -
     if known is None or known.ground_depth_path is None:
         raise CaptureError(
             f"{path} gives uneven ground, which needs a scene with its own camera and lights in the ShadowNeuS layout; "
-            "the ground of other folders is a plane. Remove the file, or give the plane with --ground HEIGHT."
+            "the ground of other folders is a plane.",
+            "remove the file",
+            Remedy.GROUND,
         )
     if options.is_trained():
         raise CaptureError(
-            f"{path} gives uneven ground, and a field trained with --preset paper or --field is held to a plane. "
-            "Use --preset draft, standard or fine without --field, or give a plane with --ground HEIGHT."
+            f"{path} gives uneven ground, and a field trained with --preset paper or --field is held to a plane.",
+            "use another preset without a field",
+            Remedy.GROUND,
         )

@@ -145,7 +145,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
     Raises:
         CalibrationError: it cannot be read, is of another format, or a value is of another kind; names it.
     """
-    return {"inputs": {}, "config": {}} | read_as(path, _Manifest, "Give another --out.")[1]
+    return {"inputs": {}, "config": {}} | read_as(path, _Manifest, "Name another folder for the results.")[1]
 
 
 def read_check(path: Path) -> dict[str, Any]:

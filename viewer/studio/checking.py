@@ -19,7 +19,7 @@ from capture.session.session import FEWEST_LIT
 from reconstruct.run.batch import PROGRAM, start_command, why_it_failed
 from reconstruct.stored_run.documents import CHECK, read_check
 from viewer.studio.helper import Helper
-from viewer.studio.page_words import in_page_words, without_folder
+from viewer.studio.words import without_folder
 
 PAUSE_S = 3.0  # without a new photo, after which a verdict is made
 LOG = "said.txt"
@@ -68,11 +68,9 @@ class Checks:
         found["numbers"] = {}
         with contextlib.suppress(UserError):
             found |= {key: value for key, value in read_check(place / CHECK).items() if key in found}
-            found["sentence"] = in_page_words(found["sentence"])
-            found |= {key: [in_page_words(text) for text in found[key]] for key in ("reasons", "advice")}
         with contextlib.suppress(UserError):
             said = str(read_check(place / REFUSED).get("sentence", ""))
-            found["error"] = in_page_words(without_folder(said, capture, "this capture"))
+            found["error"] = without_folder(said, capture, "this capture")
         is_running = self._process is not None and self._process[0] == capture
         return found | {"is_running": is_running, "is_old": self._made_of(capture) != self._mark(capture)}
 
@@ -126,7 +124,7 @@ class Checks:
         place = self._place(capture)
         place.mkdir(parents=True, exist_ok=True)
         words = [*PROGRAM, "check", str(capture), "--out", str(place)]
-        self._process = (capture, mark, start_command(words, place / LOG, gives_way=True))
+        self._process = (capture, mark, start_command(words, place / LOG, for_studio=True))
 
     def _note_end(self) -> None:
         assert self._process is not None

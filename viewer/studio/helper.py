@@ -20,6 +20,7 @@ from typing import Any
 from capture.errors import CaptureError
 from capture.files.atomic import parse_json
 from reconstruct.run.batch import start_command
+from viewer.studio.words import in_page_words
 
 PROGRAM = (sys.executable, "-m", "viewer.studio.tasks")
 IDLE_S = 120.0  # after which a helper is ended
@@ -158,6 +159,6 @@ def answer_lines(tasks: dict[str, Callable[..., Any]]) -> None:
         try:
             answer = {"answer": task(**request["arguments"], **told)}
         except Exception as error:  # noqa: BLE001  a stranger's picture may end in anything
-            answer = {"error": str(error) or type(error).__name__}
+            answer = {"error": in_page_words(error) or type(error).__name__}
         sys.stderr.write(f"{request['task']} {time.monotonic() - started:.2f} s {answer.get('error', '')}\n")
         say(answer)

@@ -19,8 +19,8 @@ from viewer.display.run_follower import RunFollower
 from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder
 from viewer.studio.growing import mark_of
-from viewer.studio.page_words import in_page_words, without_folder
 from viewer.studio.progress import run_progress
+from viewer.studio.words import without_folder
 
 PRESETS = ("draft", "standard", "fine", "paper")
 ARRIVING_S = 4.0  # after the last photo, the capture still counts as arriving
@@ -80,7 +80,7 @@ class Library:
             more = {"drop": look.get("drop", False), "looked": name in looks, "by_folder": bool(of_folder)}
             photos.append(row | more)
         refused = [
-            {"id": part.id, "name": part.name, "why": in_page_words(without_folder(why, path, "this capture"))}
+            {"id": part.id, "name": part.name, "why": without_folder(why, path, "this capture")}
             for part, why in self._parts.complaints(key)
         ]
         check = self._checks.state(path)
@@ -111,18 +111,18 @@ class Library:
             "key": key,
             "title": title_of(path, *([Path(job.task.capture)] if job else [])),
             "state": state,
-            "sentence": in_page_words(sentence),
+            "sentence": sentence,
             "job": job.id if job else "",
             "progress": asdict(now),
             "preset": preset,
             "verdict": check.get("verdict", ""),
-            "verdict_sentence": in_page_words(check.get("sentence", "")),
+            "verdict_sentence": check.get("sentence", ""),
             "size": mesh.get("size") if state == FINISHED else None,
             "unit": report.get("unit", "mm"),
             "scale": str(report.get("scale", "")),
             "guessed": ((mesh.get("evidence") or {}).get("unconstrained") or {}).get("share"),
             "growing": mark_of(path) if state == RUNNING else "",
-            "warnings": [in_page_words(text) for text in report.get("warnings", [])[:20]],
+            "warnings": report.get("warnings", [])[:20],
             "date": changed,
             "has_report": is_regular(path / "report.html"),
             "has_mesh": is_regular(path / "mesh.ply"),
@@ -202,7 +202,7 @@ def _state(job: Job | None, is_running: bool, is_finished: bool, title: str) -> 
         return FINISHED, ""
     if job is not None and job.state in (FAILED, STOPPED):
         return job.state, job.sentence or "Stopped. It goes on where it stood."
-    return STOPPED, f"{title}. It was started in a terminal: the same command goes on where it stood."
+    return STOPPED, f"{title}. It was started in a terminal. Started again there, it goes on where it stood."
 
 
 def counts_of(photos: Sequence[Mapping[str, Any]], check: Mapping[str, Any]) -> dict[str, Any]:

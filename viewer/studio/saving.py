@@ -17,7 +17,6 @@ from capture.files.title import TITLE, title_of
 from viewer.report.formats import FORMATS
 from viewer.studio.folder import StudioFolder
 from viewer.studio.helper import Helper
-from viewer.studio.page_words import in_page_words
 
 MADE_OF = ("mesh.ply", "fields.safetensors", "detail.safetensors", "stage.json", TITLE)  # what an export shows
 LONGEST_SIZE = 12  # letters of a number
@@ -91,7 +90,7 @@ class Saving:
                 continue  # removed with the trash
             found = _waiting(one) if error or not one.future.done() else one.future.result() | {"share": 1.0}
             known = {"name": one.name, "size": one.size, "title": FORMATS[one.name].title}
-            rows.append(known | found | {"error": in_page_words(str(error or ""))})
+            rows.append(known | found | {"error": str(error or "")})
         return rows
 
     def forget(self, key: str, name: str, size: str) -> None:

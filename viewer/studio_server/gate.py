@@ -19,7 +19,7 @@ from capture.errors import UserError
 from capture.files.atomic import parse_json
 from capture.files.names import in_one_line
 from viewer.page.guard import COOKIE, is_own_page, is_same
-from viewer.studio.page_words import in_page_words, without_folder
+from viewer.studio.words import in_page_words, without_folder
 
 SAFE = ("GET", "HEAD")
 LARGEST_BODY = 1 << 20  # bytes of a request that is no piece of a file
@@ -146,7 +146,7 @@ def sentences(root: Path) -> dict[Any, Any]:
 
 
 def _as_sentence(root: Path, _request: Request, error: Exception) -> Response:
-    status, text = 400, in_page_words(without_folder(str(error), root))
+    status, text = 400, without_folder(in_page_words(error), root)
     if isinstance(error, OSError):
         is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         status = 507 if is_full else 500

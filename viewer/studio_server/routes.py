@@ -18,7 +18,6 @@ from viewer.stage.files import HEADERS, HTML
 from viewer.stage.page import page_policy
 from viewer.studio import boards
 from viewer.studio.example import example_page
-from viewer.studio.page_words import document_in_page_words
 from viewer.studio.studio import Studio
 from viewer.studio_server.gate import FRAMED_POLICY, read_body, read_object, sentences, text_of
 from viewer.studio_server.phones import Phones
@@ -29,7 +28,6 @@ OWNER_FILES = ("studio.css", "dom.js", "home.js", "capture.js", "result.js", "bo
 OWNER_FILES += ("hemisphere.js", "icon.svg", "phones.js", "save.js", "voice.js", "queue.js")
 SAVED = ("format", "size")  # what a request for another kind of file names beside the run
 LARGEST_PICTURE = 1 << 22  # bytes of a run under way: ours have 100 kB
-LARGEST_DOCUMENT = 1 << 26  # bytes of the page of a verdict: ours have some megabytes
 STAGED = HEADERS | {  # of a page that runs the stage's script, and saves pictures and notes
     "Content-Security-Policy": f"sandbox allow-scripts allow-downloads allow-forms; {page_policy(is_served=False)}; "
     "frame-ancestors 'self'"
@@ -78,7 +76,7 @@ def _questions(studio: Studio, phones: Phones) -> list[Route]:
         ask("/stage/{key:path}/", lambda r: _stage(studio, r)),
         ask("/example/", lambda _: _example()),
         ask("/report", lambda r: _framed(studio.folder.run(_key(r)) / "report.html")),
-        ask("/check_page", lambda r: _check_page(studio.checks.page(studio.folder.capture(_key(r))))),
+        ask("/check_page", lambda r: _framed(studio.checks.page(studio.folder.capture(_key(r))))),
     ]
 
 
@@ -199,11 +197,3 @@ def _framed(found: Path) -> Response:
     if not is_regular(found):
         raise CaptureError(f"There is no {found.name} yet.")
     return FileResponse(found, media_type="text/html", headers=FRAMED)
-
-
-def _check_page(found: Path) -> Response:
-    """Return the page of a verdict as `_framed` does, in the words of this page."""
-    if not is_regular(found):
-        raise CaptureError(f"There is no {found.name} yet.")
-    document = read_regular(found, LARGEST_DOCUMENT).decode("utf-8", "replace")
-    return Response(document_in_page_words(document), media_type="text/html", headers=FRAMED)
