@@ -21,7 +21,7 @@ from reconstruct.detail.detail import estimate_illumination, solve_detail
 from reconstruct.detail.file import DETAIL, SURE, load_details, save_details
 from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail, specular_part
 from reconstruct.detail.full_photos import FullPhotos, colours_of, full_photos
-from reconstruct.detail.merge import merged
+from reconstruct.detail.merge import merged, rotated
 from reconstruct.detail.sample import detail_at, with_detail
 from reconstruct.detail.surface import Window, see_surface
 from reconstruct.fields import FurtherView
@@ -241,6 +241,10 @@ def test_coarse_shape_is_the_surface_s_and_fine_relief_the_photos_(ball):
         relief_ball.angles(relief.double().numpy(), true)[inner]
     )
     kept = merged(seen, relief, torch.zeros(len(relief)), 2.0)
+    x = torch.tensor([[1.0, 0, 0]]).expand(len(relief), 3)
+    far = rotated(seen.normals, x, torch.full((len(relief), 1), np.pi / 3))
+    trusted = merged(seen, far, torch.ones(len(relief)), 2.0)  # the surface is wrong where both are that far apart
+    assert np.median(relief_ball.angles(trusted.double().numpy(), far.double().numpy())[inner]) < 10
     assert torch.allclose(kept, seen.normals, atol=1e-5)
 
 

@@ -81,6 +81,17 @@ def test_edges_are_turned_where_triangles_then_face_better_and_the_mesh_stays_cl
     assert narrow[0] <= narrow[1]
 
 
+def test_no_edge_is_made_twice():
+    """An octahedron in a plate: two of its edges would face better turned, both to the line between its tips."""
+    axis = torch.arange(-4.0, 5.0)
+    plate = SdfGrid(torch.meshgrid(axis, axis, axis, indexing="ij")[1].abs() - 0.5, torch.full((3,), -4.0), 1.0)
+    places = np.array([[-2, 0.5, 0], [2, 0.5, 0], [2, -0.5, 0], [-2, -0.5, 0], [0, 0, 0.5], [0, 0, -0.5]])
+    faces = np.array([[1, 0, 4], [0, 3, 4], [3, 2, 4], [2, 1, 4], [0, 1, 5], [3, 0, 5], [2, 3, 5], [1, 2, 5]])
+    after = flipped(plate, places, faces, np.zeros(6, bool))
+    edges, uses = np.unique(np.sort(after[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)), axis=0, return_counts=True)
+    assert [4, 5] in edges.tolist() and (uses == 2).all()
+
+
 def test_a_flat_cut_at_the_ground_stays_flat():
     ground = 24.0  # through the ball
     mesh = surface_mesh(noisy_ball(), ground, MAX_NODES, is_faced=True)

@@ -12,7 +12,7 @@ from calibration.pose import Pose
 from reconstruct.fields import Fields
 from reconstruct.lies import confirmed as confirmation
 from reconstruct.lies.alignment import Alignment
-from reconstruct.lies.confirmed import confirmed, how_met, withheld
+from reconstruct.lies.confirmed import Met, confirmed, how_met, withheld
 from reconstruct.lies.motion_refine import MotionTrial
 from reconstruct.lies.rotations import stepped
 from reconstruct.lies.together import PlacedLie, SolvedLie, Together
@@ -54,6 +54,11 @@ def test_pixels_that_are_withheld_are_missing_in_the_scene_and_the_same_in_each_
     assert torch.equal(once.usable, again.usable)
     missing = float((before.usable & ~once.usable).float().mean())
     assert 0.15 < missing < 0.35
+
+
+def test_an_error_is_worse_only_beyond_its_noise():
+    assert Met("a", 0.01, 0.03, noise=0.005).is_worse(1.5)
+    assert not Met("a", 0.01, 0.03, noise=0.015).is_worse(1.5)
 
 
 def test_a_surface_of_all_meets_the_rays_of_each_lie_unless_a_motion_is_off(lies):

@@ -44,7 +44,9 @@ def test_ordinary_photos_are_one_group():
 
 @pytest.mark.parametrize(("ratio", "first"), [(0.75, 9), (1.6, 12)])
 def test_a_flashlight_that_changes_its_power_is_told_from_which_photo_on(lights, ratio, first):
-    stack = photograph(Recipe(width=WIDTH, lights=of_power(of_power(lights, 0.5, range(N)), ratio, range(first, N)))).stack
+    stack = photograph(
+        Recipe(width=WIDTH, lights=of_power(of_power(lights, 0.5, range(N)), ratio, range(first, N)))
+    ).stack
     found = find_mixture(numbers(stack))
     assert found is not None and found.cause == "power" and not found.spoilt().any()
     names = [path.name for path in stack.paths]

@@ -7,7 +7,7 @@ import lit_table
 import numpy as np
 import pytest
 
-from capture.checks.moved_photos import check_and_register, register
+from capture.checks.moved_photos import RINGING, check_and_register, register
 from capture.photos.finding import keep_findings, kept_findings
 from capture.photos.photo import PhotoStack
 
@@ -71,6 +71,7 @@ def test_saturated_pixels_move_with_their_photo(stack):
     check_and_register(changed)
     rows, columns = np.nonzero(changed.clipped[5])
     assert abs(rows.mean() - 101.5) < 0.6 and abs(columns.mean() - 198.5) < 0.6
+    assert np.ptp(rows) == np.ptp(columns) == 3 + 2 * RINGING  # moving back carries their colour so far
 
 
 def test_a_tripod_that_was_pushed_far_stays_out(stack):

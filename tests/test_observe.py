@@ -71,6 +71,11 @@ def test_the_ground_is_tested_again_only_when_lights_moved_by_more_than_its_gain
     assert float(((again.mask - first.mask).abs() > 0.1).float().mean()) < 1e-3
 
 
+def test_of_two_levels_that_as_many_photos_show_the_brighter_is_lit_ground():
+    shown = torch.tensor([[0.5, 0.3, 0.5, 0.3, 0.5, 0.3], [0.3, 0.3, 0.3, 0.3, 0.5, 0.5]])
+    assert ground_module._densest(shown).tolist() == pytest.approx([0.5, 0.3])
+
+
 def test_the_light_inside_shadows_is_taken_out():
     scene, truth = render((BALL,), replace(PLAIN, ambient=0.16))
     found = ground_module.test_ground(replace(scene, ambient=torch.zeros(3)))  # as if it were light between surfaces

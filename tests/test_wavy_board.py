@@ -10,6 +10,7 @@ from calibration.board.board import parse_board
 from calibration.board.board_pose import GroundFit, fit_ground
 from calibration.board.corners import Corners
 from calibration.board.intrinsics import CameraFit, fit_camera
+from calibration.board.sheet import USUAL_SIZE, sheet_of, weigh_waves
 from calibration.camera import Camera
 from calibration.pose import Pose
 from capture.decode.exif import FULL_FRAME_DIAGONAL
@@ -114,6 +115,13 @@ def test_the_heights_of_a_sheet_are_found_and_stand_on_the_table():
     assert np.abs(bends[1] - bends[0]).max() < 0.2 * np.ptp(bends[0])
     assert -0.1 < found.min() < 0.02
     assert any("wavy" in note for note in fit.notes)
+
+
+def test_waves_that_no_photo_tells_of_are_as_large_as_those_of_sheets_usually_are():
+    sheet = sheet_of([corners_of(BOARDS[0], CAMERA, look_at((75.0, -105.0, 500.0)))])
+    k = sheet.basis.shape[1]
+    unknown = weigh_waves(sheet, np.zeros(k), np.zeros((k, k)), 48.0, 48.0, 0.05)
+    assert unknown.size == 0 and unknown.possible == pytest.approx(USUAL_SIZE, rel=0.05)
 
 
 def test_a_board_without_any_noise_that_faces_the_camera_gives_a_camera():

@@ -5,7 +5,6 @@ the shadow of what it does see. No ray needs matter there, and no ray proves it 
 the rays, this finds a tight one.
 """
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -25,7 +24,6 @@ STEPS = 200  # at most: bulges up to a radius of 2 sqrt(STEPS * STABLE_STEP) = 1
 CHECK_EVERY = 10  # steps after which phi becomes a distance again
 AT_REST = 0.05  # voxels of movement in so many steps: the flow ends
 SEEN_SHELL = 1  # voxels about what the camera sees: known without shadows
-SLIVER = 2  # px: wider is no sliver, see _slivers
 EXPLAINED = 1.0  # voxels beside seen matter at which a ray may pass and needs no other: a coarse edge is off by as much
 NEAR = 3.0  # voxels about the surface in which it moves
 SHARPNESS = 8.0  # NeuS s per voxel: a ray that passes a tenth of a voxel inside counts as blocked
@@ -111,33 +109,11 @@ def _seen(surface: SdfGrid, scene: Scene, rays: Supervision) -> tuple[Float[np.n
     hit, on_object = first.distance.double().numpy(), first.on_object.numpy() & (rays.role != kernels.GROUND)
     end = np.where(on_object, hit, np.where(rays.role == kernels.OBJECT, np.inf, rays.ground_t))
     points = scene.eye.double().numpy() + np.where(np.isfinite(end), end, np.nan)[:, None] * rays.directions
-    plain = on_object & ~_slivers(hit, on_object, rays, scene.directions.shape[:2], SEEN_SHELL * surface.spacing)
-    nodes = np.rint((points[plain] - surface.origin.double().numpy()) / surface.spacing).astype(int)
+    nodes = np.rint((points[on_object] - surface.origin.double().numpy()) / surface.spacing).astype(int)
     nodes = nodes[((nodes >= 0) & (nodes < surface.values.shape)).all(1)]
     shell = np.zeros(tuple(surface.values.shape), bool)
     shell[tuple(nodes.T)] = True
     return points, ndimage.binary_dilation(shell, iterations=SEEN_SHELL)
-
-
-def _slivers(
-    hit: Float[np.ndarray, " pixels"],
-    on_object: Bool[np.ndarray, " pixels"],
-    rays: Supervision,
-    shape: tuple[int, int],
-    step: float,
-) -> Bool[np.ndarray, " pixels"]:
-    """Find pixels at the outline that see a surface behind a nearer edge: they may just miss that edge.
-
-    Args:
-        hit: world length along each pixel's ray.
-        shape: of the picture.
-        step: world length from which something lies behind.
-    """
-    depth = np.full(shape, np.inf, np.float32)
-    depth.flat[rays.pixels[on_object]] = hit[on_object]
-    window = np.ones((2 * SLIVER + 1,) * 2, np.uint8)
-    found = (depth > cv2.erode(depth, window) + step) & np.isinf(cv2.dilate(depth, window))
-    return found.flat[rays.pixels]
 
 
 def _dark_rays(scene: Scene, rays: Supervision, points: Float[np.ndarray, "pixels 3"], spacing: float) -> Rays:
