@@ -113,7 +113,7 @@ def test_in_a_white_furnace_the_ball_receives_what_the_ground_receives_and_nothi
 
 def test_a_thin_wall_has_patches_on_both_sides():
     nodes = torch.stack(torch.meshgrid(*[torch.arange(n).float() for n in (70, 70, 9)], indexing="ij"), -1)
-    beyond = (nodes - torch.tensor([35.0, 35, 4.3])).abs() - torch.tensor([30.0, 30, 0.6])
+    beyond = (nodes - torch.tensor([35.0, 35, 4.75])).abs() - torch.tensor([30.0, 30, 0.6])
     wall = find_patches(SdfGrid(beyond.amax(-1), torch.zeros(3), 1.0), None)
     assert wall is not None and wall.size > 2 * 0.6
     for facing in (1, -1):

@@ -46,17 +46,16 @@ def test_a_refused_file_is_said_without_the_servers_path_or_a_folder_that_the_se
         assert str(tmp_path) not in one["why"] and "from the folder" not in one["why"], one["why"]
 
 
-@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 @pytest.mark.browser
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-def test_each_refused_file_is_named_once_and_dismissed_without_an_offer_to_try_again(browser, tmp_path, size):  # noqa: F811
+def test_each_refused_file_is_named_once_and_dismissed_without_an_offer_to_try_again(browser, tmp_path):  # noqa: F811
     photos = tmp_path / "drop"
     photos.mkdir()
     for name, content in {"notes.txt": b"x", "IMG_1.jpg": b"no photo", "list.md": b"y", "IMG_2.jpg": jpeg(2)}.items():
         (photos / name).write_bytes(content)
     with served(tmp_path / "studio") as (_, _, owner):
         key = owner.ok("new", title="vase")
-        tab, _ = opened(browser, owner, size)
+        tab, _ = opened(browser, owner, PHONE)
         tab.goto(f"http://127.0.0.1:{owner.port}/#/capture/{key.replace('/', '%2F')}")
         with tab.expect_file_chooser() as chooser:
             tab.click("text=Choose files")

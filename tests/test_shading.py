@@ -55,9 +55,7 @@ def test_positions_are_found_to_half_a_per_cent_despite_object_shadows_and_textu
     assert all(light.used for light in found.lights)
 
 
-@pytest.mark.parametrize(
-    ("near", "reach"), [(0.24, (380, 850)), (0.35, (600, 1400)), (0.6, (220, 400)), (2.2, (250, 700))]
-)
+@pytest.mark.parametrize(("near", "reach"), [(0.24, (380, 850)), (2.2, (250, 700))])
 def test_lights_are_found_wherever_the_camera_stands(near, reach):
     """From a coin seen from 150 mm to a chair seen from 1.4 m: a hand holds the light as far away as ever."""
     recipe = Recipe(near=near, lights=handheld_lights(12, np.random.default_rng(7), reach))

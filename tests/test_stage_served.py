@@ -60,7 +60,7 @@ def test_notes_come_through_the_socket_into_the_run(address, run):
 
 def test_the_result_is_saved_as_other_kinds_of_files_and_as_no_unknown_one(address):
     page = asked(address, "/stage/")[1].decode()
-    for kind, begins in (("stl", b""), ("glb", b"glTF"), ("ply", b"ply"), ("obj", b"PK")):
+    for kind, begins in (("glb", b"glTF"), ("obj", b"PK")):
         assert f'"{kind}":[' in page
         content = eventually(address, f"/stage/save/{kind}")
         assert len(content) > 10_000 and content.startswith(begins)

@@ -122,17 +122,11 @@ def test_keys_of_strangers_lead_nowhere(open_studio, key):
 
 STRANGE = {
     "long": "a" * 5000,
-    "longer than a name": "a" * 300,
     "bytes that are no text": "\udcff",
-    "half a letter": "\ud800",
     "nothing": "\0",
-    "lines": "a\r\nb: c\u2028",
-    "backwards": "\u202egpj.a",
     "up": "../" * 50,
-    "a number": 3,
     "a list": [["a"]],
     "an object": {"a": {}},
-    "none": None,
 }
 NAMES = ("key", "title", "photo", "part", "id", "board", "role", "preset", "job", "action", "format", "size", "paper")
 NAMES += ("token", "name", "capture")
