@@ -11,7 +11,6 @@ from reconstruct.fields import save_fields
 SHAPES = {
     "heap": HEAP,
     "lollipop": (Sphere((0.0, 0.0, 50.0), 24.0), Box((-6, -6, 0), (6, 6, 40))),
-    "bench": (Box((-40, -24, 34), (40, 24, 44)), Box((-40, -24, 0), (-28, 24, 40)), Box((28, -24, 0), (40, 24, 40))),
 }
 
 

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import stat
 import subprocess
 import sys
 import threading
@@ -190,16 +189,3 @@ def test_a_cluster_runs_every_capture_also_when_a_worker_is_killed(tmp_path):
         ray.shutdown()
     assert {name: outcome.exit_code for name, outcome in outcomes.items()} == {"bad": 2, "good": 0, "long": 0}
     assert starts(tasks[2]) == 2
-
-
-def test_the_record_is_whole_after_every_capture(tmp_path):
-    tasks = tasks_of(tmp_path, captures(tmp_path / "in", one="fine", two="fine"))
-    sizes: list[int] = []
-
-    def tell(outcomes: object) -> None:
-        file = tmp_path / "out" / "batch.json"
-        sizes.append(len(json.loads(file.read_text())["outcomes"]) if file.exists() else 0)
-
-    run_batch(tasks, partial(locally, jobs=1), tell)
-    assert sizes == [0, 1, 2]
-    assert stat.S_IMODE((tmp_path / "out" / "batch.json").stat().st_mode) == 0o644

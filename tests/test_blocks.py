@@ -47,18 +47,6 @@ def whole(phi: np.ndarray) -> Blocks:
     return pack(phi, np.inf)
 
 
-def test_blocks_far_from_the_surface_are_not_stored_and_say_how_far_they_are():
-    phi = np.full((80, 80, 80), BAND, np.float32)
-    phi[:, :, :24] = -BAND
-    phi[16:24, 16:24, 40:48] = 0.0
-    field = pack(phi)
-    assert (
-        field.layout[2, 2, 5] >= 0 and field.layout[2, 2, 2] >= 0
-    )  # cells between -far and far are in the layer below
-    assert field.layout[2, 2, 0] == -(2 * 2 + 1) and field.layout[2, 2, 9] == -2 * 4 and field.layout[9, 9, 8] == -2 * 6
-    np.testing.assert_array_equal(field.dense(), phi)
-
-
 @pytest.mark.parametrize("sharpness", [4.0, 25.0])
 def test_rays_that_leap_find_what_rays_through_every_node_find(sharpness):
     field = LevelSet(two_balls(), np.zeros(3), 1.0).field

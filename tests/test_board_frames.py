@@ -65,19 +65,6 @@ def test_a_frame_of_markers_gives_the_pose(spec, is_turned, is_legacy):
     assert_right_ground(corners, pose)
 
 
-@pytest.mark.parametrize("is_legacy", [False, True])
-def test_two_rows_of_markers_tell_both_generations_apart(is_legacy):
-    """By their middles alone, the newer pattern is the older one sheared by two squares."""
-    board = parse_board("charuco:7x6:25:18:DICT_4X4_50")
-    pose = pose_above(board, seed=2)
-    photo = board_photo(board, CAMERA, pose, is_legacy=is_legacy)
-    strip = np.array([[-0.5, -0.9, 0], [7.5, -0.9, 0], [7.5, -5.1, 0], [-0.5, -5.1, 0]]) * board.square_mm
-    corners = find_board(covered(photo, CAMERA.project(pose.inverse().apply(strip)), 140), board)
-    assert corners is not None and len(corners.pixels) >= 6
-    assert off_px(corners, pose).max() < 1
-    assert_right_ground(corners, pose)
-
-
 @pytest.mark.parametrize("spec", SPECS)
 def test_a_frame_is_recognised_without_a_name(spec):
     board = parse_board(spec)

@@ -11,9 +11,8 @@ from PIL.TiffImagePlugin import IFDRational
 
 from calibration.board.board import Board, parse_board
 from calibration.board.board_photos import fit_board
-from calibration.board.board_scale import scale_doubts, scale_of, scale_parts, scale_sentence
+from calibration.board.board_scale import scale_of, scale_parts, scale_sentence
 from calibration.camera import Camera
-from capture.decode.exif import Optics
 from capture.session.session import Session, SessionSettings
 
 CAMERA = Camera(1200, 900, 1000.0, 1000.0, 599.5, 449.5)
@@ -106,19 +105,3 @@ def test_what_every_length_rests_on_is_one_sentence(spec, is_named, said):
 @pytest.mark.parametrize("entry", [None, 3, {"length": 1, "from": "x"}, {"length": "x"}])
 def test_a_strangers_entry_of_the_scale_is_left_out(entry):
     assert scale_parts({"scale": entry}) is None and scale_sentence({"scale": entry}) == ""
-
-
-@pytest.mark.parametrize(
-    ("optics", "closest"),
-    [
-        (Optics(), 68.3),  # an ordinary phone
-        (Optics(1.57, 13.0), 6.5),  # a phone's wide lens, which does macro
-        (Optics(6.9, 24.0), 102.1),
-        (Optics(50.0, 75.0), 100.0),  # a larger camera, at life size
-        (Optics(70.0), 140.0),  # which one it is, its focal length alone tells
-    ],
-)
-def test_how_near_a_lens_is_sharp_follows_from_its_focal_length(optics, closest):
-    assert optics.closest_mm() == pytest.approx(closest, abs=0.1)
-    near, far = (scale_doubts(BOARD, away, "IMG_1.jpg", optics, None) for away in (0.9 * closest, 1.1 * closest))
-    assert len(near) == 1 and "not sharp nearer" in near[0] and far == []

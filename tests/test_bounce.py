@@ -17,7 +17,7 @@ from reconstruct.labels.observer import Observer
 from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.render.g_buffer import look
 from reconstruct.render.interreflection import photo_interreflection, true_scale
-from reconstruct.render.radiosity import find_patches, nearest_patches
+from reconstruct.render.radiosity import find_patches
 from reconstruct.render.relight import environment, relight
 from reconstruct.sdf.grid import SdfGrid
 from tests.fake_run import fields_of
@@ -51,35 +51,10 @@ def from_plane(points: torch.Tensor, normals: torch.Tensor, radiosity) -> Float[
     return np.array(out)
 
 
-@pytest.fixture(scope="module")
-def patches():
-    found = find_patches(sphere_grid(), 0.0)
-    assert found is not None
-    return found
-
-
 def scene(interreflection: float, albedo: float = 0.5) -> Fields:
     return Fields(
         sphere_grid(), torch.full((48, 64, 3), albedo), CAMERA, POSE, 0.0, "scene", interreflection=interreflection
     )
-
-
-def test_ground_lit_from_overhead_lights_the_ball_around_its_shadow(patches):
-    distance = (patches.points[:, :2] - CENTRE[:2]).norm(dim=-1)
-    arriving = ((distance > RADIUS) & ~patches.on_object).float()[:, None].expand(-1, 3)
-    polar = np.linspace(0.2, np.pi, 15)
-    points, normals = on_ball(polar)
-    ours = (
-        nearest_patches(patches, points, normals)
-        .interpolated(patches.bounced(torch.ones_like(arriving), arriving))[:, 0]
-        .numpy()
-    )
-    truth = from_plane(points, normals, lambda r: (r > RADIUS).astype(float))
-    assert abs(truth[-1] - HEIGHT_ABOVE**2 / (RADIUS**2 + HEIGHT_ABOVE**2)) < 2e-3  # its closed form straight below
-    assert np.abs(ours - truth).max() < 0.03 and abs((ours - truth).mean()) < 0.01
-
-
-HEIGHT_ABOVE = HEIGHT - RADIUS  # of the ball's lowest point
 
 
 def test_a_lamp_from_overhead_lights_the_dark_half_of_the_ball_by_the_ground():

@@ -87,15 +87,6 @@ def test_hands_in_a_third_of_the_photos_are_found(eighteen):
     assert dropped(findings) == [(f"IMG_{k}.jpg", "covered") for k in hands]
 
 
-def test_a_highlight_of_the_table_covers_nothing(eighteen):
-    """It washes the grain out over 4 % of the picture, but falls off without an edge."""
-    v, u = np.mgrid[: lit_table.HEIGHT, : lit_table.WIDTH]
-    rgb = eighteen.rgb.copy()
-    glow = 0.75 * np.exp(-((u - 80) ** 2 + (v - 190) ** 2) / (2 * 22**2))
-    rgb[4] = rgb[4] * (1 - glow[..., None] / 0.8) + glow[..., None].astype(np.float32)
-    assert check_stack(replace(eighteen, rgb=rgb.astype(np.float32))) == ()
-
-
 def test_on_a_table_without_texture_nothing_is_said_about_blur_and_motion():
     rng = np.random.default_rng(2)
     plain = lit_table.stack_of(lit_table.lit_photos(N, rng, np.full((lit_table.HEIGHT, lit_table.WIDTH), 0.4)))

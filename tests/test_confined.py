@@ -168,17 +168,6 @@ def test_an_answer_that_is_none_is_refused(task, photo, tmp_path, monkeypatch):
     assert_goes_on(tmp_path)
 
 
-def test_no_open_files_pile_up(photo, tmp_path):
-    before = len(os.listdir("/proc/self/fd"))
-    for task in (hostile.well_behaved, hostile.breaks_off, hostile.says_it_is_damaged) * 2:
-        try:
-            first_answer(task, photo)
-        except CaptureError:
-            continue
-    stop_decoders()
-    assert len(os.listdir("/proc/self/fd")) == before
-
-
 def test_a_process_that_went_away_while_it_waited_is_replaced(photo):
     process = int(first_answer(hostile.well_behaved, photo).numbers[1])
     os.kill(process, signal.SIGKILL)

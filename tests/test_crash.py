@@ -1,6 +1,5 @@
 """A kill, a fault or a damaged file at any moment leaves a checkpoint that loads, and the same surface in the end."""
 
-import os
 import resource
 import subprocess
 import sys
@@ -13,9 +12,7 @@ from synthetic import BALL, Look, render
 
 from capture.errors import ReconstructionError
 from capture.files import atomic
-from reconstruct.initialization import choose_start
 from reconstruct.solve import solver
-from reconstruct.solve.checkpoint import CheckpointWriter
 from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, previous_of, read_checkpoint, write_checkpoint
 from reconstruct.solve.solver import FitConfig, Level, fit
 
@@ -131,30 +128,6 @@ def test_a_kill_at_every_step_of_writing_a_checkpoint_leaves_one_that_loads(tmp_
     assert int(done.stdout) >= 16  # eight steps, before and after each
 
 
-@pytest.mark.parametrize("name", ["fsync", "replace"])
-def test_a_fault_while_writing_a_checkpoint_leaves_the_earlier_ones_and_no_half_file(tmp_path, monkeypatch, name):
-    path = tmp_path / "checkpoint.safetensors"
-    store(path, 1.0)
-    store(path, 2.0)
-    real = getattr(os, name)
-    for fails_at in range(1, 4):
-        calls = []
-
-        def failing(*arguments, calls=calls, fails_at=fails_at):
-            calls.append(arguments)
-            if len(calls) == fails_at:
-                raise OSError(5, "Input/output error")
-            return real(*arguments)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(atomic.os, name, failing)
-            try:
-                store(path, 3.0)
-            except OSError:
-                assert not [p.name for p in tmp_path.iterdir() if atomic.TEMPORARY in p.name]
-        assert stored(path) in (2.0, 3.0)
-
-
 def test_the_last_two_checkpoints_are_kept_and_a_damaged_one_is_passed_over_with_a_sentence(tmp_path):
     path = tmp_path / "checkpoint.safetensors"
     for value in (1.0, 2.0, 3.0):
@@ -207,24 +180,6 @@ def test_a_solve_stopped_anywhere_ends_in_the_very_same_surface_and_lights(stop,
     torch.testing.assert_close(resumed.grid.values, straight.grid.values, rtol=0, atol=0)
     torch.testing.assert_close(resumed.lights, straight.lights, rtol=0, atol=0)
     torch.testing.assert_close(resumed.evidence, straight.evidence, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("is_hull", [True, pytest.param(False, marks=pytest.mark.slow)])  # 6 s: a height field
-def test_a_killed_solve_never_makes_its_first_surface_again(is_hull, scene, tmp_path, monkeypatch):
-    file = tmp_path / "checkpoint.safetensors"
-    monkeypatch.setattr(solver, "hull_is_better", lambda *_: is_hull)
-    monkeypatch.setattr(CheckpointWriter, "write", lambda _: None)  # a kill lets nothing be written
-    first = Stop(1)
-    with pytest.raises(KeyboardInterrupt):
-        fit(scene, TINY, first, file)
-    for name in ("carved", "fit_heights"):
-        monkeypatch.setattr(choose_start, name, None)
-    monkeypatch.setattr(solver, "hull_is_better", lambda *_: pytest.fail("the start was judged again"))
-    resumed = Stop(1)
-    with pytest.raises(KeyboardInterrupt):
-        fit(scene, TINY, resumed, file)
-    assert f"making the {'shadow hull' if is_hull else 'height field'}" in first.messages
-    assert resumed.messages == first.messages[3:]  # all but those of the start
 
 
 def test_a_full_disk_ends_a_solve_and_keeps_its_last_checkpoint(scene, straight, tmp_path, monkeypatch):

@@ -7,30 +7,26 @@ import pytest
 import relief_ball
 import torch
 
-import capture.photos.photo
-from calibration.calibrated_views import CalibratedView, CalibratedViews
+from calibration.calibrated_views import CalibratedViews
 from calibration.known_scene import KnownScene
 from calibration.pose import Pose
 from capture.errors import CaptureError, ReconstructionError
-from capture.photos.photo import decode_srgb, read_photo, read_stack
-from capture.session.capture import Capture
+from capture.photos.photo import decode_srgb, read_stack
 from reconstruct.appearance.brdf import LOBES
 from reconstruct.appearance.lobe_fit import Samples
-from reconstruct.detail import full_photos as detail_photos
 from reconstruct.detail.detail import estimate_illumination, solve_detail
 from reconstruct.detail.file import DETAIL, SURE, load_details, save_details
 from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail, specular_part
 from reconstruct.detail.full_photos import FullPhotos, colours_of, full_photos
 from reconstruct.detail.merge import merged, rotated
-from reconstruct.detail.sample import detail_at, with_detail
+from reconstruct.detail.sample import detail_at
 from reconstruct.detail.surface import Window, see_surface
 from reconstruct.fields import FurtherView
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.mesh.simplify import simplified
 from reconstruct.mesh.texture import bake, size_for
-from reconstruct.render.g_buffer import look
 from reconstruct.run.detail_stage import write_detail
-from reconstruct.run_folder.folder import KEPT, RunFolder
+from reconstruct.run_folder.folder import RunFolder
 from reconstruct.run_folder.once import done_once
 from reconstruct.scene import build_scene
 from reconstruct.shading.noise import Noise
@@ -96,18 +92,6 @@ def test_nothing_is_claimed_along_the_outline_and_beyond_it(ball, detail):
     assert (detail.normals[detail.confidence == 0] == 0).all(-1).mean() > 0.5
 
 
-def test_a_view_shows_the_detail_where_it_is_sure(ball, detail):
-    camera = ball.calibration.camera
-    plain = look(ball.fields, posed_camera=replace(ball.fields.posed_camera, camera=camera))
-    fine = with_detail(plain, [detail], camera)
-    sure = np.zeros(ball.mask.shape, bool)
-    inside(detail, sure)[:] = detail.confidence > 0.9 * SURE
-    before = relief_ball.angles(plain.maps.normals.double().numpy()[sure], ball.normals[sure])
-    after = relief_ball.angles(fine.maps.normals.double().numpy()[sure], ball.normals[sure])
-    assert np.median(after) < 0.5 * np.median(before)
-    assert with_detail(plain, [], camera) is plain
-
-
 def test_the_baked_pictures_hold_relief_and_colour(ball, detail):
     full = extract_mesh(ball.fields)
     small, size = simplified(full, 2000), 512
@@ -166,25 +150,6 @@ def test_the_stage_leaves_a_detail_and_is_done_once(ball, tmp_path):
         assert run.costs["detail"].cpu_seconds > 0
         assert len(load_details(run.file(DETAIL), ball.fields)) == 1
         assert "of memory and" in run.file("log.jsonl").read_text()
-
-
-def test_reduced_photos_that_the_run_keeps_are_not_decoded_again(ball, tmp_path, monkeypatch):
-    known = KnownScene(ball.calibration, ball.paths, None, None)
-    source, options = Source(tmp_path, known=known), RunOptions(detail="on", preset="fine")
-    with RunFolder(tmp_path / "run") as run:
-        run.claim({}, {})
-        read_photos(source, options, run.file(KEPT))
-        whole = []
-
-        def counted(path, *how):
-            whole.append(path)
-            return read_photo(path, *how)
-
-        monkeypatch.setattr(capture.photos.photo, "_read_reduced", None)
-        again = read_photos(source, options, run.file(KEPT))
-        monkeypatch.setattr(detail_photos, "read_photo", counted)
-        write_detail(source, options, run, again, CalibratedViews.of(ball.calibration), ball.fields)
-        assert whole == list(ball.paths) and run.file(DETAIL).exists()
 
 
 def test_photos_of_another_size_than_the_calibrated_are_refused(ball):
@@ -309,25 +274,3 @@ def test_the_details_of_all_views_come_back_from_one_file(both, tmp_path):
     assert [one.view for one in load_details(path, fields)] == [1]
     with pytest.raises(ReconstructionError, match="a detail of view 2 was found, the surface has 1"):
         load_details(path, replace(fields, further=()))
-
-
-def test_the_stage_reads_every_view_and_says_which(both, ball, turned, tmp_path, monkeypatch):
-    fields, _ = both
-    calibrated = CalibratedViews(
-        (CalibratedView("view_1", ball.calibration),),
-        lies=(CalibratedViews((CalibratedView("turned_1", turned[0].calibration),), name="turned_1"),),
-    )
-    sources = [
-        Source(tmp_path, Capture(tmp_path, (), name=name), KnownScene(one.calibration, one.paths, None, None))
-        for name, one in (("view_1", ball), ("turned_1", turned[0]))
-    ]
-    options = RunOptions(detail="on")
-    photos = tuple(replace(read_photos(replace(one, capture=None), options)[0], view=one.name) for one in sources)
-    monkeypatch.setattr(Source, "views", lambda _: tuple(sources))
-    monkeypatch.setattr(Source, "session", None)
-    with RunFolder(tmp_path / "run") as run:
-        run.claim({}, {})
-        write_detail(sources[0], options, run, photos, calibrated, fields)
-        assert [one.view for one in load_details(run.file(DETAIL), fields)] == [0, 1]
-        log = run.file("log.jsonl").read_text()
-    assert "view_1: " in log and "turned_1: " in log

@@ -207,17 +207,6 @@ def test_an_output_that_cannot_be_written_to_ends_in_one_sentence(capsys):
     assert code == 2 and "/proc/shadowgraph" in error and "--out" in error and len(error.splitlines()) == 1
 
 
-@pytest.mark.parametrize("message", ["", "[enforce fail] DefaultCPUAllocator: can't allocate memory: 5 bytes"])
-def test_a_memory_without_room_ends_in_one_sentence(capsys, tmp_path, monkeypatch, message):
-    def full(*_: object) -> None:
-        raise RuntimeError(message) if message else MemoryError()
-
-    monkeypatch.setattr("shadowgraph.command.execute", full)
-    assert shadowgraph.main(["doctor"]) == 2
-    error = capsys.readouterr().err
-    assert "memory" in error and "--preset draft" in error and len(error.splitlines()) == 1
-
-
 def test_a_real_lack_of_memory_is_recognised(capsys, monkeypatch):
     def allocate(*_: object) -> None:
         soft, hard = resource.getrlimit(resource.RLIMIT_AS)

@@ -8,7 +8,6 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.field import SdfField
 from reconstruct.shadowneus.grid_field import GridField
 from reconstruct.shadowneus.hash_field import HashField, HashLevels
-from reconstruct.shadowneus.losses import eikonal_loss
 from reconstruct.shadowneus.mlp_field import Materials, Network, NeuralField, specular
 
 REACH, RADIUS, GROUND = 2.0, 1.0, -0.7
@@ -80,15 +79,6 @@ def test_the_gradient_is_that_of_the_sdf(name):
     )
     difference = (field.gradient(points) - numeric).norm(dim=-1)
     assert difference.median() < 0.02  # grids have kinks, so not at every point
-
-
-@pytest.mark.parametrize("name", TRAINABLE)
-def test_the_eikonal_loss_reaches_the_parameters(name):
-    field = TRAINABLE[name]()
-    eikonal_loss(field, places(64)).backward()
-    gradients = [p.grad for p in field.parameters() if p.grad is not None]
-    assert all(g.isfinite().all() for g in gradients)
-    assert max(float(g.abs().max()) for g in gradients) > 0
 
 
 def test_the_trainable_grid_reads_like_the_solved_one():

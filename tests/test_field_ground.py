@@ -60,15 +60,6 @@ def test_the_field_labels_what_the_lights_model_cannot(heap):
     assert found.albedo.isfinite().all() and found.gain.isfinite().all() and found.ambient > 0
 
 
-@pytest.mark.parametrize(("radius", "albedo"), [(20.0, 0.02), (25.0, 0.02), (20.0, 0.03)])
-def test_a_nearly_black_thing_on_ground_without_an_end_is_object(radius, albedo):
-    """The lights' model alone finds an albedo and a shadow for each of its pixels."""
-    ball = Sphere((0.0, -20.0, radius), radius, (albedo,) * 3)
-    scene, truth = render((ball,), replace(LOOK, noise=0.01))
-    assert overlap(by_the_lights(scene).mask.numpy() > 0.5, truth.mask) < 0.6
-    assert overlap(label_ground(scene).mask.numpy() > 0.5, truth.mask) > 0.9
-
-
 def test_powers_follow_the_object_and_its_normals_with_them():
     scene, truth = render((BALL,), LOOK)
     scene, gains = spotted(scene)

@@ -8,8 +8,6 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from reconstruct.run.machine import Speed, Work, planned_seconds, whole_seconds
-from reconstruct.run.presets import preset
 from reconstruct.run_folder.folder import Progress
 from reconstruct.run_folder.forecast import STAGE_NAMES, Forecast, left_text, plan_numbers
 from shadowgraph.terminal import Display
@@ -121,16 +119,3 @@ def test_a_terminal_shows_one_bar_of_the_whole_and_names_each_stage_once(is_term
     names = [row.partition(":")[0] for row in text.getvalue().splitlines() if not row.startswith("solve")]
     each = [name for k, name in enumerate(names) if k == 0 or name != names[k - 1]]
     assert each == [name for stage, name in STAGE_NAMES.items() if stage in PLANNED or stage == "done"]
-
-
-@pytest.mark.parametrize(("photos", "megapixels"), [(12, 0.8), (36, 12.0), (200, 24.0)])
-def test_more_photos_finer_presets_and_slower_machines_take_longer(photos, megapixels):
-    speed, slower = Speed(0.63e-6, 0.4e-6), Speed(0.63e-6, 2e-6)  # the same processor, shared with others
-    runs = [preset(name, 0) for name in ("draft", "standard", "fine")]
-    seconds = [whole_seconds(planned_seconds(own, speed, Work(photos, megapixels, side))) for side, own in runs]
-    assert seconds == sorted(seconds)
-    for side, own in runs:
-        work = Work(photos, megapixels, side)
-        more = whole_seconds(planned_seconds(own, speed, work._replace(photos=2 * photos)))
-        assert whole_seconds(planned_seconds(own, speed, work)) < more
-        assert whole_seconds(planned_seconds(own, slower, work)) > whole_seconds(planned_seconds(own, speed, work))

@@ -49,17 +49,6 @@ def test_raw_colours_keep_the_sensors_own_balance(tmp_path):
     assert np.abs(read_photo(path).rgb[5:-5, 5:-5] - [0.2, 0.4, 0.6]).max() < 1e-3
 
 
-def test_two_raw_photos_of_one_scene_differ_only_by_their_exposure(tmp_path):
-    """No auto-brightness, no white level adapted to the picture: twice the light is twice the value."""
-    rng = np.random.default_rng(0)
-    scene = rng.uniform(0.01, 0.45, (32, 48))
-    photos = [
-        read_photo(write_dng(tmp_path / f"{gain}.dng", BLACK + gain * scene * (WHITE - BLACK), BLACK, WHITE)).rgb
-        for gain in (1, 2)
-    ]
-    assert np.abs(photos[1] - 2 * photos[0]).max() < 1e-3
-
-
 def test_a_raw_file_without_picture_data_is_refused(tmp_path):
     path = write_dng(tmp_path / "empty.dng", np.full((32, 32), BLACK), BLACK, WHITE)
     with pytest.raises(CaptureError, match=r"empty\.dng has no picture in it"):

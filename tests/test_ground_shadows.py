@@ -64,19 +64,6 @@ def test_lights_whose_stated_error_is_large_are_notsurely_placed():
     assert surely_placed(LightFit(lights, (), np.zeros(3)), np.zeros(3)) == 0.5
 
 
-def test_ground_that_shadows_of_single_photos_enclose_stays_ground():
-    """Shadows of a thick head on a thin neck meet behind the object, each seen in one photo."""
-    figure = (np.abs(COLUMNS - 80) < 8) & (ROWS > 56) & (ROWS < 110)
-    field = _field(figure)
-    for residual, side in zip(field.residual, (-1, 1), strict=False):
-        head = (ROWS - 24) ** 2 + (COLUMNS - 80 - 25 * side) ** 2 < 27**2
-        neck = (np.abs(COLUMNS - 80 - 25 * side * (60 - ROWS) / 36) < 3) & (ROWS > 24) & (ROWS < 62)
-        residual[(head | neck) & ~figure] = -2.0
-    between = (np.abs(COLUMNS - 80) < 3) & (ROWS > 43) & (ROWS < 49)
-    assert not (field.residual[:, between] < -1).any()
-    assert not find_shadows(field).object_mask[between].any()
-
-
 def test_print_that_is_too_dark_to_show_shadows_stays_ground():
     """A black square in the shadow of three photos: no part of the object borders it."""
     figure = (np.abs(COLUMNS - 50) < 10) & (ROWS > 40) & (ROWS < 80)

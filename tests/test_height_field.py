@@ -16,8 +16,6 @@ from reconstruct.initialization.choose_start import (
     JUDGES_BLOCK,
     JUDGES_SEED,
     JUDGES_SHARE,
-    HeightStart,
-    HullStart,
     choose_start,
 )
 from reconstruct.initialization.height_field import HeightConfig, HeightField, fit_heights
@@ -219,19 +217,6 @@ def test_the_solid_on_a_grid_has_the_depth_and_the_normals_of_the_field():
     cosine = (maps.normals.numpy() * true).sum(-1)[inner].clip(-1, 1)
     assert np.degrees(np.arccos(cosine)).mean() < 4.0  # half of it are the differences taken for the truth
     assert base_of(grid) == pytest.approx(scene.ground_height, abs=1e-3)
-
-
-def test_the_start_is_a_height_field_only_where_there_is_no_ground_to_carve_with():
-    scene, _ = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=8))
-    scene, config = replace(scene, rgb=None), FitConfig()
-
-    def start(scene):
-        return choose_start(scene, Observer(scene), config)
-
-    assert isinstance(start(scene), HullStart)
-    assert isinstance(start(replace(scene, ground_known=False)), HeightStart)
-    assert isinstance(start(replace(scene, mask=torch.ones_like(scene.directions[..., 0]))), HeightStart)
-    assert isinstance(start(replace(scene, mask=None)), HeightStart)
 
 
 def judges(scene, labels):

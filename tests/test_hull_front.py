@@ -11,7 +11,6 @@ from scipy.ndimage import binary_erosion
 from reconstruct.config import FitConfig, Level
 from reconstruct.hull import bent_hull
 from reconstruct.hull.hull_front import on_front
-from reconstruct.hull.normal_integration import integrate_normals
 from reconstruct.initialization import choose_start
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
@@ -23,7 +22,6 @@ from tests.synthetic import BALL, Box, Look, Sphere, render
 SLAB = Box((-45.0, -30.0, 0.0), (45.0, 30.0, 20.0))
 HEAD = Sphere((10.0, 0.0, 12.0), 22.0)
 NODES = 56
-PIXEL = 2.1  # mm at the object
 
 
 @pytest.fixture(scope="module")
@@ -33,22 +31,6 @@ def seen():
     length = np.linalg.norm(truth.points - scene.eye.numpy(), axis=-1)
     mask = torch.from_numpy(truth.mask).float()
     return replace(scene, mask=mask), truth, np.where(truth.mask, length, np.nan)
-
-
-def shredded(length):
-    """Every other stripe of three pixels 30 mm behind its place."""
-    return length + 30.0 * (np.arange(length.shape[1]) // 3 % 2)
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_a_depth_that_is_a_guess_does_not_keep_its_breaks(seen, known):
-    scene, truth, length = seen
-    along, trust = scene.directions.double().numpy(), np.ones(length.shape)
-    given = (along, shredded(length), truth.normals, truth.normals, trust, True)
-    found = integrate_normals(*given, length - 40.0 if known else None)
-    off = found - length
-    rough = np.nanstd(off)
-    assert rough < 3 * PIXEL if known else rough > 10.0
 
 
 def test_the_hull_is_made_anew_behind_the_front(seen):

@@ -1,7 +1,5 @@
 """Lit and dark rays tell a tray's rim, which is there, from the lid of its shadow hull, which is not."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -59,15 +57,6 @@ def test_rays_tell_the_rim_from_the_lid(seen, smeared):
     assert belief[there & truth.mask].mean() > 0.8
     assert belief[~there & truth.mask].mean() < 0.2
     assert (belief[~truth.mask] == 0.5).all()  # no ray tells
-
-
-def test_wrong_labels_are_outvoted(seen, smeared):
-    scene, truth, _, hull, labels, *_ = seen
-    behind, there, alike = smeared
-    wrong = torch.rand(labels.visibility.shape, generator=torch.manual_seed(0)) < 0.03
-    noisy = replace(labels, visibility=torch.where(wrong, 1 - labels.visibility, labels.visibility))
-    right = (matter_of_hull(hull, scene, noisy, behind, 1, alike) > 0.5) == there
-    assert right[truth.mask].mean() > 0.85
 
 
 def test_the_integral_is_held_where_matter_is_and_breaks_beside_it(seen, smeared):

@@ -28,7 +28,6 @@ from calibration.scenes.importers import find_importer, import_folder
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
 from reconstruct.initialization.choose_start import ShadingStart, choose_start
 from reconstruct.labels.observer import Observer
-from reconstruct.labels.outline import bright_object
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.run.presets import preset
 from reconstruct.scene import build_scene
@@ -101,22 +100,6 @@ def test_intensities_are_powers_and_sixteen_bits_are_linear(tmp_path):
     assert any("focal length 320 px" in note for note in known.notes) and any("scale" in note for note in known.notes)
 
 
-@pytest.mark.parametrize(("folder", "named"), [("images", ""), ("Objects", "Objects/"), ("data", None)])
-def test_photos_of_this_layout_may_lie_in_a_folder_beside_the_lists(tmp_path, folder, named):
-    """Named by their names, by folder and name, or not at all."""
-    truth = seen_from_above(side=32, n_lights=6)
-    write_diligent(tmp_path, truth, np.ones((6, 3)))
-    (tmp_path / folder).mkdir()
-    names = [f"{i:03d}.png" for i in range(1, 7)]
-    for name in (*names, "mask.png"):
-        (tmp_path / name).rename(tmp_path / folder / name)
-    lines = "" if named is None else "".join(f"{named}{name}\n" for name in names)
-    (tmp_path / "filenames.txt").write_text(lines) if lines else (tmp_path / "filenames.txt").unlink()
-    known = loaded(tmp_path)
-    assert [path.relative_to(tmp_path).as_posix() for path in known.rgb_paths or ()] == [f"{folder}/{x}" for x in names]
-    assert known.mask_path is not None
-
-
 def test_directions_in_columns_are_read_and_photos_go_by_number_without_a_list(tmp_path):
     truth = seen_from_above(side=32, n_lights=11)
     write_diligent(tmp_path, truth, np.ones((11, 3)))
@@ -128,15 +111,6 @@ def test_directions_in_columns_are_read_and_photos_go_by_number_without_a_list(t
     known = loaded(tmp_path)
     assert [path.name for path in known.rgb_paths or ()] == [f"frog_{i + 1}.png" for i in range(11)]
     np.testing.assert_allclose(known.calibration.lights[9].direction, towards_lights(truth)[9], atol=1e-6)
-
-
-def test_without_a_mask_the_object_is_what_is_bright_before_a_dark_background():
-    truth = seen_from_above((Sphere((0, 0, 40), 20),))
-    rgb = truth.stack.rgb * np.where(truth.mask, 1, 0.01)[..., None].astype(np.float32)
-    rgb[:, 32, 32] = 0  # dark paint
-    found = bright_object(torch.from_numpy(rgb)).numpy() > 0.5
-    assert (found != truth.mask).mean() < 0.02 and found[32, 32]
-    assert bright_object(torch.from_numpy(truth.stack.rgb)).all()  # a light ground is no dark background
 
 
 # --- RTI -------------------------------------------------------------------------------------------------------------
@@ -178,14 +152,6 @@ def test_a_list_that_the_photos_contradict_is_warned_of(tmp_path, change, words)
 def flipped(line):
     name, x, y, z = line.split()
     return f"{name} {x} {-float(y)} {z}"
-
-
-def test_a_light_behind_the_picture_is_left_out_with_its_reason(tmp_path):
-    lines = write_rti(tmp_path, seen_from_above(side=32, n_lights=6))
-    lines[2] = "stone_02.jpg 0.6 0.8 -0.01"
-    (tmp_path / "assembly-files" / "stone.lp").write_text("\n".join(lines))
-    light = loaded(tmp_path).calibration.lights[1]
-    assert not light.used and "degrees above the picture plane" in light.reason
 
 
 def test_three_photos_are_too_few_to_read_a_shape_from_shading(tmp_path):
@@ -325,15 +291,6 @@ def test_a_list_with_the_light_of_every_photo_needs_no_board(tmp_path, name, is_
     found = np.array([light.direction for light in calibration.lights])
     np.testing.assert_allclose(found, towards_lights(truth), atol=1e-5)
     assert calibration.unit == "scene" and any("distant one was assumed" in x for x in calibration.residuals["notes"])
-
-
-def test_a_list_that_lacks_photos_without_a_board_says_what_both_would_need(tmp_path):
-    write_rti(tmp_path / "theirs", seen_from_above(side=32, n_lights=6))
-    capture = tmp_path / "capture"
-    (tmp_path / "theirs" / "jpeg-exports").rename(capture)
-    (tmp_path / "some.lp").write_text("stone_01.png 0 0 1\nother.png 0 1 1\n")
-    with pytest.raises(CaptureError, match=r"board in room light.*lists 2 lights .* holds 6 photos"):
-        open_source(capture, RunOptions(lights=str(tmp_path / "some.lp")))
 
 
 def no_lights(path):

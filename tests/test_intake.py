@@ -4,7 +4,6 @@ import asyncio
 import io
 import stat
 import struct
-import threading
 import zipfile
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -12,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from waiting import PATIENCE_S
 
 from capture.errors import CaptureError
 from capture.intake import archive, arrivals
@@ -319,22 +317,6 @@ def test_what_grows_as_no_photo_does_is_not_unpacked(studio, method):
         made.writestr("photo.jpg", jpeg())
     done = send(Parts(studio / "parts", studio), "v.zip", file.getvalue())
     assert done.arrived == ("photo.jpg",) and len(done.remarks) == 4 and "times" in done.remarks[0]
-
-
-def test_a_photo_arrives_while_an_archive_is_being_unpacked(studio, monkeypatch):
-    parts = Parts(studio / "parts", studio)
-    sent = []
-
-    def other_arrives(_entry: zipfile.ZipInfo, _room: int, _capture: Path) -> None:
-        name = f"other{len(sent)}.jpg"
-        sent.append(threading.Thread(target=send, args=(parts, name, jpeg(9 + len(sent)))))
-        sent[-1].start()
-        sent[-1].join(PATIENCE_S)
-        assert (studio / "vase" / name).is_file()
-
-    monkeypatch.setattr(archive, "_refuse", other_arrives)
-    assert send(parts, "v.zip", packed(zipfile.ZIP_DEFLATED)).arrived == ("0.jpg", "1.jpg", "2.jpg")
-    assert len(sent) == 3
 
 
 def test_an_archive_is_held_to_the_number_and_the_bytes_of_its_files(studio, monkeypatch):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from reconstruct.hull.follow_normals import _matter_behind, follow_normals
+from reconstruct.hull.follow_normals import follow_normals
 from reconstruct.hull.normal_integration import integrate_behind, integrate_normals, integrate_within
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
@@ -91,19 +91,6 @@ def test_a_hollow_lies_below_the_lid_that_a_hull_puts_on_it(block):
     beside = block[1].mask & ~inside
     assert within[back].mean() < 0.7 * tied[back].mean()
     assert within[beside].mean() < 0.3 * PIXEL < 3 * PIXEL < tied[beside].mean()
-
-
-def test_matter_ends_where_its_surface_does_or_at_the_ground(block):
-    """One ray goes down through the block, which stands on the ground; one across it, level, and meets no ground."""
-    scene, truth = block
-    low = torch.tensor([-60.0, -45.0, 0.0])
-    at = torch.stack(torch.meshgrid(*(torch.arange(n) for n in (41, 31, 21)), indexing="ij"), -1) * 3.0 + low
-    values = torch.from_numpy(truth.sdf(at.reshape(-1, 3).numpy().astype(float))).float().reshape(at.shape[:3])
-    points = torch.tensor([[0.0, 0.0, 40.0], [-45.0, 0.0, 20.0]])
-    rays = torch.tensor([[0.6, 0.0, -0.8], [1.0, 0.0, 0.0]])
-    to_ground = torch.tensor([(40.0 - scene.ground_height) / 0.8, torch.nan])
-    found = _matter_behind(SdfGrid(values, low, 3.0), points, rays, to_ground)
-    np.testing.assert_allclose(found, [50.0, 90.0], atol=3.0)
 
 
 def test_a_grid_follows_the_normals_of_its_labels(block):

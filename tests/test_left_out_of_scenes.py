@@ -158,19 +158,6 @@ def test_a_bad_picture_of_shadows_is_left_out_with_its_photo_and_light(tmp_path,
     assert read is not None and len(read) == PHOTOS - 1
 
 
-@pytest.mark.parametrize("layout", [rti, diligent])
-def test_another_list_by_order_counts_the_photos_that_were_left_out(tmp_path, truth, layout):
-    paths = photos_of(layout(tmp_path / "scene", truth))
-    truncated(paths[2])
-    given = tmp_path / "given.lp"
-    np.savetxt(given, towards_lights(truth), fmt="%.6f", header=str(PHOTOS), comments="")
-    options = RunOptions(lights=str(given))
-    source = open_source(tmp_path / "scene", options)
-    lights = calibrate_source(source, read_photos(source, options), options).first.lights
-    wanted = np.delete(towards_lights(truth), 2, axis=0)
-    assert np.abs(np.array([light.direction for light in lights]) - wanted).max() < 1e-3
-
-
 @pytest.mark.parametrize("is_named", [False, True], ids=["beside the photos", "by --lights"])
 @pytest.mark.parametrize("name", ["lights.csv", "lights.lp", "lights.mat"])
 def test_a_list_with_fewer_rows_than_photos_says_both_counts_and_the_remedy(tmp_path, truth, name, is_named):

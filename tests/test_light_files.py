@@ -97,15 +97,6 @@ def test_shadowneus_scenes_are_placed_by_their_camera(tmp_path, kind):
         np.testing.assert_allclose(places(given), PLACES, atol=1e-6)
 
 
-def test_a_plain_list_may_give_several_lights_to_a_photo(tmp_path):
-    file = tmp_path / "lights.json"
-    rows = [{"photo": PHOTOS[0], "position": [0, 0, 500]}, {"photo": PHOTOS[0], "direction": [0, 3, 4]}]
-    file.write_text(json.dumps({"lights": rows}))
-    given = read_lights(file, PHOTOS[:1], POSED_CAMERA)
-    assert [light.kind for light in given.lights] == ["point", "directional"]
-    np.testing.assert_allclose(given.lights[1].direction, [0, 0.6, 0.8])
-
-
 def test_a_list_with_sigmas_is_weighed_against_what_the_photos_say(tmp_path):
     file = tmp_path / "lights.json"
     shading = tuple(replace(light, sigma=np.full(3, 3.0)) for light in LIGHTS)

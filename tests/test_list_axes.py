@@ -101,17 +101,6 @@ def test_the_way_that_a_list_fits_is_said_with_the_figures(tmp_path, height, way
         assert f"Write '{ROWS[way]}' for x y z" in sentence
 
 
-@pytest.mark.parametrize("way", [0, 1, 4, 7])
-def test_places_are_tried_by_the_way_to_them(tmp_path, way):
-    far = 40 * SIDE * np.linspace(0.7, 1.3, PHOTOS)
-    places = listed_so_that(way) * far[:, None]
-    write(tmp_path, egg, places, power=1 / (far / far.max()) ** 2 * 0.2)
-    lines = (tmp_path / "lights.lp").read_text().splitlines()[1:]
-    (tmp_path / "lights.csv").write_text("\n".join(["photo,x,y,z", *(line.replace(" ", ",") for line in lines)]))
-    (tmp_path / "lights.lp").unlink()
-    assert [f"'{ROWS[way]}' for x y z" in text for text in warnings_of(tmp_path)] == [True] * bool(way)
-
-
 @pytest.mark.parametrize("orientation", [2, 3, 4, 5, 6, 7, 8])
 def test_a_list_over_the_upright_pictures_is_told_by_their_orientation(tmp_path, orientation):
     """The frame is that of the stored photos."""

@@ -10,7 +10,6 @@ from synthetic import BALL, HEAP, Box, Look, default_lights, render
 
 from reconstruct.labels import ground_test as ground_module
 from reconstruct.labels.labels import assemble_labels, not_isolated
-from reconstruct.labels.outline import may_hold_shadow, object_region
 from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.scene import Scene
 
@@ -150,14 +149,6 @@ def test_beside_colour_shadow_pictures_give_the_shadows_and_colour_the_normals_a
     assert torch.equal(labels.albedo[found.mask > 0.5], shading.albedo[found.mask > 0.5])
 
 
-def test_an_object_cut_by_the_frame_is_the_object_though_there_is_a_speck_inside():
-    likely = torch.zeros(80, 80, dtype=torch.bool)
-    likely[20:60, :30] = True
-    likely[50:53, 60:63] = True  # 5 px when its corners are smoothed away
-    region = object_region(likely, torch.ones(80, 80, dtype=torch.bool))
-    assert region[40, 10] and not region[51, 61]
-
-
 def test_a_single_wrong_pixel_says_nothing_and_a_line_one_pixel_wide_does():
     shadow = torch.zeros(1, 12, 12)
     shadow[0, :, 6:] = 1.0
@@ -174,17 +165,6 @@ def under(scene, photos) -> Scene:
     names = tuple(name for name, kept in zip(scene.photo_names, photos, strict=True) if kept)
     chosen = {part: getattr(scene, part)[torch.from_numpy(photos)] for part in parts}
     return replace(scene, **chosen, photo_names=names)
-
-
-def test_ground_that_no_light_reaches_is_not_taken_for_a_sure_object():
-    scene, truth = render((BALL,), replace(PLAIN, n_lights=60, ambient=0.06, noise=0.002))
-    lights = scene.lights.numpy()
-    behind = lights[:, 1] > 0.6 * np.hypot(lights[:, 0], lights[:, 1])  # the ball: its shadow lies before it
-    never_lit = (truth.visibility[behind].sum(0) == 0) & ~truth.mask
-    assert never_lit.sum() > 300
-    found = ground_module.test_ground(under(scene, behind))
-    is_sure = (found.mask > 0.5) * found.mask_confidence
-    assert is_sure.numpy()[never_lit].mean() < 0.4
 
 
 @pytest.mark.parametrize("lights, least", [(6, 0.8), (12, 0.99)])
@@ -226,17 +206,6 @@ def test_ground_that_is_mostly_in_shadow_has_the_albedo_that_it_shows_in_the_sun
     assert share_wrong(found.visibility, found.confidence, truth, ~truth.mask) < 0.003
 
 
-def test_pixels_that_no_photo_shows_are_neither_object_nor_ground():
-    scene, truth = render((BALL,), PLAIN)
-    usable = scene.usable.clone()
-    usable[:, 90:110, 20:60] = False  # clipped in every photo
-    usable[2:, 90:110, 100:140] = False  # in all but two, which may both lie in shadow
-    found = ground_module.test_ground(replace(scene, usable=usable))
-    assert not truth.mask[90:110].any()
-    assert (found.mask_confidence[92:108, 22:58] == 0).all() and (found.mask_confidence[92:108, 102:138] == 0).all()
-    assert found.mask_confidence[92:108, 70:90].mean() > 0.9
-
-
 @pytest.mark.parametrize("paint", [(0.09, 0.03, 0.012), (0.03, 0.05, 0.012)])
 def test_dark_paint_of_another_hue_is_object_and_no_ground_in_the_dark(paint):
     scene, truth = render((BALL,), replace(PLAIN, n_lights=20, noise=0.002, ambient=0.02))
@@ -264,12 +233,3 @@ def test_what_is_dark_where_no_shadow_of_the_object_may_fall_is_no_shadow():
     assert not said.any()
     kept = (truth.visibility < 0.5) & ~truth.mask & ~beyond
     assert (found.confidence.numpy()[kept] > 0).mean() > 0.9
-
-
-def test_where_the_object_is_cut_by_the_frame_every_shadow_may_be_its_own():
-    scene, truth = render(HEAP, PLAIN)
-    whole = torch.from_numpy(truth.mask)
-    assert 0.02 < may_hold_shadow(scene, whole).float().mean() < 0.8
-    cut = whole.clone()
-    cut[:, 0] = True
-    assert may_hold_shadow(scene, cut).all() and may_hold_shadow(scene, torch.zeros_like(whole)).all()

@@ -19,7 +19,7 @@ from calibration.outlines.coherence_kernels import BETTER
 from calibration.outlines.metric_cues import MetricCues
 from calibration.outlines.outline_maps import PIXEL_ERROR, TALLEST, outline_maps, with_cues
 from calibration.outlines.shadow_start import STARTS, shadow_starts
-from calibration.outlines.terms import DROP_OUTLINE, FALSE_SPOT, OutlineTerms
+from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
 from calibration.pose import Pose
 from calibration.side_view import SideView
 
@@ -199,21 +199,6 @@ def test_rows_are_derivatives_of_the_highlights_cost(ball):
     value, _ = terms.rows(lights)
     plain, _ = OutlineTerms(maps, EYE, 0.0, every, every).rows(lights)
     assert len(value) == len(plain) + 2 * len(miss)
-
-
-def test_a_false_highlight_costs_no_more_than_a_few_contradicting_rays(ball):
-    """And pulls no light that is far from where it would be true: its row has hardly a slope."""
-    _, lights, maps = ball
-    every = np.ones(len(lights), bool)
-    spot = MirrorHighlights(np.array([2]), np.array([[300.0, 200.0, 0.0]]), np.array([0.01]))
-    terms, plain = (OutlineTerms(maps, EYE, 0.0, every, every, one) for one in (spot, None))
-    assert np.linalg.norm(terms._half_vectors(lights)[0]) > 10 * FALSE_SPOT
-    assert terms.cost(lights) - plain.cost(lights) <= FALSE_SPOT**2 / 2
-    value, slopes = terms.rows(lights)
-    pull = np.linalg.norm(slopes[-2:, 2].T @ value[-2:])
-    near = replace(spot, sigma=np.array([10.0]))
-    straight, gentle = OutlineTerms(maps, EYE, 0.0, every, every, near).rows(lights)
-    assert pull < 1e-4 * np.linalg.norm(gentle[-2:, 2].T @ straight[-2:]) * (10.0 / 0.01) ** 2
 
 
 def test_starts_are_of_several_heights(ball):

@@ -47,15 +47,6 @@ def test_an_ablation_is_one_setting_of_either_solver():
     assert training("paper", "auto", "telescoped", 0)[1].use_telescoped
 
 
-def test_a_finer_preset_looks_at_more_pixels_with_more_rays_on_a_finer_grid():
-    draft, standard, fine = (preset(name, 0) for name in ("draft", "standard", "fine"))
-    for coarser, finer in ((draft, standard), (standard, fine)):
-        assert coarser[0] < finer[0] and coarser[1].rays < finer[1].rays
-        assert coarser[1].levels[-1].nodes < finer[1].levels[-1].nodes
-        nodes = [level.nodes for level in finer[1].levels]
-        assert nodes == sorted(set(nodes))  # coarse to fine
-
-
 def test_shadows_of_one_role_alone_keep_their_confidence():
     scene, _ = render((BALL,), Look(n_lights=8, with_shadow=True, with_mask=True))
     rays = supervise(scene, assemble_labels(replace(scene, rgb=None), None, None))

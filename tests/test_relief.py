@@ -6,7 +6,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import torch
-from bumpy import BALL, HEIGHT, ground_at, normals_at, render_bumpy
+from bumpy import BALL, ground_at, render_bumpy
 from synthetic import BALL as BALL_ON_PLANE
 from synthetic import Look, render
 from test_known import write_scene
@@ -17,10 +17,10 @@ from capture.errors import CalibrationError, CaptureError
 from reconstruct.config import FitConfig, Level
 from reconstruct.hull.shadow_hull import shadow_hull
 from reconstruct.labels.observer import Observer
-from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
+from reconstruct.labels.uneven_ground import ground_relief, ground_visibility
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.render.g_buffer import surface_maps
-from reconstruct.scene import build_scene, ground_points, reduced
+from reconstruct.scene import build_scene, ground_points
 from reconstruct.solve.solver import fit
 from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
@@ -39,16 +39,6 @@ def scene_of(truth, pictures):
         return build_scene(truth.stack, truth.calibration, 120, ground_depth=truth.ground_depth)
     mask = truth.mask.astype(float)
     return build_scene(None, truth.calibration, 120, truth.shadow, mask, truth.ground_depth)
-
-
-def test_ground_points_and_normals_are_those_of_the_bumps(truth):
-    scene = scene_of(truth, "shadows")
-    points = ground_points(scene).double().numpy().reshape(-1, 3)
-    assert np.abs(points[:, 2] - ground_at(points[:, 0], points[:, 1])).max() < 1e-2
-    assert -HEIGHT - 1e-2 < scene.ground_height < -0.99 * HEIGHT
-    cosine = (ground_normals(scene).numpy().reshape(-1, 3) * normals_at(points)).sum(1)
-    assert np.degrees(np.arccos(np.median(cosine))) < 3
-    assert ground_points(reduced(scene, 60)).isfinite().all()
 
 
 def test_shadows_of_the_ground_on_itself_are_left_out_and_little_else(truth):

@@ -6,10 +6,8 @@ import pytest
 import torch
 
 import shadowgraph
-from calibration.light import irradiance
 from capture.decode.exr import read_exr, write_exr
 from capture.photos.photo import encode_srgb
-from reconstruct.export.relit import lamp_at
 from reconstruct.render.g_buffer import look
 from reconstruct.render.relight import relight
 from reconstruct.stored_run.stored_run import StoredRun
@@ -47,16 +45,6 @@ def test_a_png_is_the_same_picture_in_srgb(run, tmp_path):
     linear = colours(relit(run, tmp_path, "--light", "100,-200,400"))
     png = cv2.imread(str(relit(run, tmp_path, "--light", "100,-200,400", name="it.png")))[..., ::-1]
     assert np.array_equal(png, encode_srgb(linear))
-
-
-def test_a_far_lamp_lights_the_middle_as_the_captures_near_ones_did(run):
-    it = StoredRun(run)
-    middle = np.array([5.0, 5, 25])
-    light = lamp_at(it.calibration, middle, np.array([3.0, 0, 4, 0]), 1.0)
-    assert np.allclose(light.direction, [0.6, 0, 0.8])
-    used = [other for other in it.calibration.lights if other.used]
-    wanted = np.median([irradiance(middle, None, other, it.calibration.beam) for other in used], axis=0)
-    assert np.allclose(light.power, wanted)
 
 
 def test_a_lamp_of_some_size_has_softer_shadows(run, tmp_path):

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from calibration.calibration import save_calibration
 from reconstruct.check.light_coverage import widest_gap
-from reconstruct.run_folder.folder import RunFolder
 from viewer.report.drawing import difference_picture, mesh_picture
 from viewer.report.figures import curves, lights_from_above
 from viewer.report.pictures import guess_facts, mesh_pictures
@@ -86,18 +84,6 @@ def test_the_report_of_a_whole_run_has_every_part(whole_page):
     assert read.tags.count("svg") == 3, "lights from above, coverage, curves"
 
 
-def test_a_note_of_the_calibration_that_the_run_repeats_is_shown_once(tmp_path, truth):
-    fake_run.start_run(tmp_path, truth)
-    fake_run.finish_run(tmp_path, truth)
-    note = "lights: placed by how bright the ground is, and by nothing else"
-    calibration = fake_run.calibration_of(truth)
-    noted = replace(calibration, residuals={**calibration.residuals, "notes": [note]})
-    save_calibration(noted, tmp_path / "calibration.json")
-    report = json.loads((tmp_path / "report.json").read_text())
-    (tmp_path / "report.json").write_text(json.dumps({**report, "assumptions": [note]}))
-    assert Reader(page_of(tmp_path)).text.count(note) == 1
-
-
 def test_the_report_asks_no_server_for_anything(whole_page):
     read = Reader(whole_page)
     assert read.loads and all(load.startswith("data:image/") for load in read.loads)
@@ -120,16 +106,6 @@ def test_a_run_that_stopped_early_says_where_and_why(tmp_path, truth):
     assert "There is no mesh. Stopped while fitting the surface." in Reader(page_of(tmp_path)).text
     (tmp_path / "report.json").write_text(json.dumps({"error": "board found in 0 of 4 photos"}))
     assert "The run stopped: board found in 0 of 4 photos" in Reader(page_of(tmp_path)).text
-
-
-def test_a_run_that_stopped_early_says_what_its_finished_stages_cost(tmp_path, truth):
-    fake_run.start_run(tmp_path, truth)
-    with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path) as run:
-        run.claim({}, {})
-        with run.stage("calibrate"):
-            pass
-        raise KeyboardInterrupt
-    assert "Finding camera and lights" in Reader(page_of(tmp_path)).text
 
 
 def test_an_empty_folder_gets_a_report_too(tmp_path):

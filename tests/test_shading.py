@@ -15,21 +15,19 @@ from flashlight_photos import (
     photograph,
 )
 
-from calibration.flashlight.fit import FlashlightFit, collect, first_guess, fit_flashlights, without_gloss
+from calibration.flashlight.fit import collect, first_guess, fit_flashlights, without_gloss
 from calibration.flashlight.light_estimate import locate_lights
 from calibration.flashlight.model import (
     LOWEST_COSINE,
     PER_FLASHLIGHT,
     Flashlights,
-    Priors,
     _model,
     free_tangent,
     jacobian,
     log_irradiance,
 )
-from calibration.flashlight.uncertainty import beam_error, unseen_error
+from calibration.flashlight.uncertainty import beam_error
 from calibration.flashlight.wall import WALL_TERMS
-from calibration.lights.ground_cells import sample_ground
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 
@@ -133,16 +131,6 @@ def test_six_photos_do_not_show_whether_the_beam_is_round_and_say_so():
     assert truth.share_inside(found.lights) > 0.8
 
 
-def test_of_many_photos_fewer_cells_are_kept_evenly_spread(truth):
-    few = sample_ground(truth.stack, POSED_CAMERA, np.arange(2))
-    many = sample_ground(truth.stack, POSED_CAMERA, np.tile(np.arange(10), 12))
-    share = len(many.points) / len(few.points)
-    assert 0.2 < share < 0.6
-    quarter = 2 * (few.points[:, 0] > few.centre[0]) + (few.points[:, 1] > few.centre[1])
-    kept = 2 * (many.points[:, 0] > few.centre[0]) + (many.points[:, 1] > few.centre[1])
-    np.testing.assert_allclose(np.bincount(kept) / np.bincount(quarter), share, rtol=0.15)
-
-
 @pytest.mark.parametrize(
     "curve",
     [
@@ -174,22 +162,6 @@ def test_a_camera_that_looks_past_the_ground_is_refused(truth):
     level = replace(WORLD_FROM_CAMERA, rotation=np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
     with pytest.raises(CalibrationError, match="does not look down at the ground"):
         locate_lights(truth.stack, PosedCamera(CAMERA, level, 0.0), every(truth.stack))
-
-
-def test_a_light_whose_power_stands_out_is_less_sure_of_its_distance(truth):
-    evidence, _ = collect(truth.stack, POSED_CAMERA, every(truth.stack))
-    start = first_guess(evidence)
-    n = len(start.log_power)
-    power = np.zeros(n)
-    power[0] = 0.08
-    steady, other = (
-        FlashlightFit(replace(start, log_power=p), evidence, evidence.weight, Priors(), free_tangent)
-        for p in (np.zeros(n), power)
-    )
-    grown = unseen_error(other) ** 2 - unseen_error(steady) ** 2
-    distance = np.linalg.norm(start.positions - evidence.cells.centre, axis=1)
-    np.testing.assert_allclose(grown[1:], 0.0, atol=1e-6)
-    assert np.sqrt(grown[0]) == pytest.approx(0.04 * distance[0], rel=1e-3)
 
 
 @pytest.mark.slow

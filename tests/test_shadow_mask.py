@@ -53,15 +53,6 @@ def test_shadow_pictures_without_a_mask_start_from_the_hull():
     assert isinstance(choose_start(scene, Observer(scene), preset("standard", 0)[1]), HullStart)
 
 
-def test_a_given_mask_colour_and_unknown_ground_are_left_alone():
-    scene, truth = render((BALL,), replace(LOOK, n_lights=4))
-    given = replace(scene, rgb=None, mask=torch.from_numpy(truth.mask.astype(np.float32)))
-    assert with_object_mask(given) is given
-    assert with_object_mask(scene) is scene
-    unknown = replace(scene, rgb=None, ground_known=False)
-    assert with_object_mask(unknown) is unknown
-
-
 def test_shadows_that_no_object_on_the_ground_throws_are_left_to_the_height_field():
     scene, _ = render((), LOOK)
     assert scene.shadow is not None

@@ -197,21 +197,3 @@ def test_shadow_pictures_of_several_cameras_need_no_photos():
     assert all(assemble_labels(scene, None, None).visibility.any() for scene in scenes)
     found = fit(scenes, replace(QUICK, levels=QUICK.levels[:1]), lambda **_: None)
     assert error(found.grid, points_on()) < 2.5
-
-
-def test_material_is_read_where_an_object_stands_on_the_ground_and_not_along_its_outline():
-    axis = torch.arange(-40.0, 41.0, 2.0)
-    nodes = torch.stack(torch.meshgrid(axis, axis, axis + 40, indexing="ij"), -1)
-    apart = (nodes - torch.tensor([0.0, 0.0, 15.0])).abs() - torch.tensor([21.0, 21.0, 15.0])
-    distance = apart.clamp(min=0).norm(dim=-1) + apart.max(-1).values.clamp(max=0)
-    grid = SdfGrid(distance, torch.tensor([-40.0, -40.0, 0.0]), 2.0)
-    camera, pose = default_camera(200, 150)
-    fields = Fields(grid, torch.full((150, 200, 3), 0.5), camera, pose, 0.0, "mm")
-    maps = surface_maps(grid, fields.posed_camera)
-    mask, depth = maps.mask.numpy(), maps.depth.numpy()
-    material = seen_material(fields)
-    known = KDTree(material.object_points).query(maps.points.numpy())[0] < 1e-6
-    foot = mask[:-1] & ~mask[1:] & (np.abs(depth[:-1] - depth[1:]) < 4)
-    top = mask[1:] & ~mask[:-1] & (depth[:-1] - depth[1:] > 20)
-    assert foot.sum() > 10 and known[:-1][foot].mean() > 0.8
-    assert top.sum() > 10 and not known[1:][top].any()

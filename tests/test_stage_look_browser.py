@@ -200,24 +200,6 @@ def test_what_is_known_has_its_legend_with_the_menu_closed(window):
     assert not tab.locator("#legend").is_visible()
 
 
-def test_keys_work_whatever_has_the_focus(window):
-    tab = window(1600, 1000)
-    for focused in ("#menu", "#share", "#drag-view", "#follows", "#height"):
-        tab.focus(focused)
-        before = state(tab)
-        tab.keyboard.press("5" if before["shown"]["look"] == "photo" else "1")
-        assert state(tab)["shown"]["look"] != before["shown"]["look"], focused
-        tab.keyboard.press("l")
-        assert state(tab)["shown"]["follows"] is not before["shown"]["follows"], focused
-        if focused != "#height":  # a slider's arrows are its own
-            tab.keyboard.press("Shift+ArrowLeft")
-            assert state(tab)["view"]["azimuth"] != before["view"]["azimuth"], focused
-        tab.keyboard.press("?")
-        assert tab.locator("#keys").is_visible() and "move the lamp" in tab.locator("#keys").inner_text()
-        tab.keyboard.press("Escape")
-        assert not tab.locator("#keys").is_visible()
-
-
 def test_one_click_shares_the_page_as_one_file_that_works(browser, run, window, tmp_path):
     tab = window(390, 844)
     with tab.expect_download() as download:

@@ -9,8 +9,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from fake_run import make_truth
-from laid_anew import laid_anew
 from PIL import Image
 from scipy.spatial import KDTree
 from waiting import PATIENCE_S
@@ -31,7 +29,6 @@ from reconstruct.stored_run.stage_document import EMPTY, save_stage_document
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.report.formats import FORMATS
 from viewer.stage import page as stage_page_module
-from viewer.stage.cameras import camera_facts, light_facts
 
 WIDTH, HEIGHT = 320, 240
 VIEW = {"azimuth": -1.2, "elevation": 0.7, "distance": 420.0, "focal": FOCAL_HEIGHTS, "shift": [0, 0]}
@@ -55,19 +52,6 @@ def stage(run) -> Studio:
 
 
 # --- what the page is told ---------------------------------------------------------------------------------------
-
-
-def test_cameras_and_lights_of_another_lie_are_told_in_the_frame_of_the_surface(tmp_path):
-    run = StoredRun(laid_anew(tmp_path / "whole", make_truth(width=64, n_lights=4)))
-    studio = studio_of(np.asarray(run.mesh.bounds))
-    first, turned = (camera_facts(seen, studio) for seen in run.fields.views())
-    assert (first["view"], turned["view"]) == ("view_1", "turned_1")
-    for name in ("eye", "axes", "focal", "middle"):
-        np.testing.assert_allclose(first[name], turned[name], atol=1e-5)
-    lights = light_facts(run, studio)
-    assert [one["camera"] for one in lights] == [0] * 4 + [1] * 4
-    assert [one["photo"] for one in lights[4:]] == [f"turned_1/{one['photo']}" for one in lights[:4]]
-    np.testing.assert_allclose([one["place"] for one in lights[:4]], [one["place"] for one in lights[4:]], atol=1e-5)
 
 
 # --- what is packed --------------------------------------------------------------------------------------------------

@@ -1,6 +1,5 @@
 """What visitors of the page ask of a run: followed where a solve can be resumed from, and forgotten by the next run."""
 
-import json
 import threading
 import time
 from dataclasses import replace
@@ -133,15 +132,3 @@ def test_only_requests_of_the_fixed_set_can_be_made_and_only_they_are_read(tmp_p
     for name in REQUESTS:
         make_request(tmp_path, name)
     assert open_requests(tmp_path) == {"pause", "next-level", "stop", "fine"}
-
-
-def test_a_stage_that_is_reopened_is_done_again_by_the_next_run(tmp_path):
-    with RunFolder(tmp_path) as run:
-        run.claim({}, {})
-        for stage in ("solve", "mesh"):
-            with run.stage(stage):
-                pass
-        run.reopen("solve", "never begun")
-    with RunFolder(tmp_path) as run:
-        assert run.is_finished("mesh") and not run.is_finished("solve")
-    assert json.loads((tmp_path / "manifest.json").read_text())["finished"] == ["mesh"]

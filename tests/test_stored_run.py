@@ -33,7 +33,7 @@ from reconstruct.run.bundle import write_bundle
 from reconstruct.stored_run.maps import read_thumbnail
 from reconstruct.stored_run.ply import read_mesh
 from reconstruct.stored_run.stored_run import StoredRun
-from reconstruct.tensor_file import read_tensors, write_tensors
+from reconstruct.tensor_file import read_tensors
 from viewer.display.run_follower import RunFollower, status
 from viewer.report.report import read_results, write_report
 from viewer.stage.pack_file import stored_stage
@@ -115,15 +115,6 @@ def test_a_packed_stage_is_whole_or_counts_as_none(run):
         assert pack is None or all(isinstance(pack.read(name), bytes) for name in pack.names)
         (run / "stage.zip").write_bytes(content)
     assert len(said) == 10
-
-
-def test_the_bytes_of_tensors_depend_on_nothing_but_their_content(tmp_path):
-    files, texts = [tmp_path / f"{number}.safetensors" for number in range(8)], {name: f"é {name}" for name in "dacb"}
-    for file in files:
-        write_tensors({"distance": torch.arange(5.0), "albedo": torch.ones(2, 3).half()}, texts, file)
-    assert len({file.read_bytes() for file in files}) == 1
-    stored = read_tensors(files[0])
-    assert stored.header == texts and torch.equal(stored.tensors["distance"], torch.arange(5.0))
 
 
 def test_a_file_of_tensors_is_in_memory_and_not_mapped_so_that_cutting_it_later_harms_nothing(run):

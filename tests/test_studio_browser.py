@@ -69,36 +69,6 @@ def test_from_an_empty_folder_to_a_run_with_the_mouse_alone(browser, tmp_path, p
     assert (folder / "runs" / "Capture-draft").is_dir()
 
 
-def test_the_keyboard_alone_makes_renames_and_deletes_a_capture(browser, tmp_path):
-    with served(tmp_path) as (_, _, owner):
-        tab, bad = opened(browser, owner, DESKTOP)
-        tab.wait_for_selector("text=New capture")
-
-        def press_until(words: str) -> None:
-            for _ in range(30):
-                tab.keyboard.press("Tab")
-                now = "(document.activeElement.getAttribute('aria-label') || document.activeElement.innerText || '')"
-                if words in tab.evaluate(f"document.activeElement === document.body ? '' : {now}"):
-                    return
-            raise AssertionError(f"{words} cannot be reached by the keyboard")
-
-        press_until("New capture")
-        tab.keyboard.press("Enter")
-        tab.keyboard.type("Blue vase")
-        tab.keyboard.press("Enter")
-        tab.wait_for_selector("h1:has-text('Blue vase')")
-        press_until("All captures")
-        tab.keyboard.press("Enter")
-        tab.wait_for_selector(".card")
-        press_until("Delete Blue vase")
-        tab.keyboard.press("Enter")
-        press_until("Delete")
-        tab.keyboard.press("Enter")
-        tab.wait_for_selector("text=Trash: 1 thing")
-        assert not bad
-    assert not (tmp_path / "captures" / "Blue-vase").exists()
-
-
 @pytest.mark.slow
 def test_a_phone_that_left_in_the_middle_is_said_on_the_page_and_can_be_gone_on_without(browser, tmp_path):
     capture_in(tmp_path, "vase")

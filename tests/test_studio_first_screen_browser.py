@@ -21,7 +21,6 @@ on_a_page = [
 STATE = "window.shadowgraph ? window.shadowgraph.state() : null"
 SMALL = {"width": 1000, "height": 640}
 SIZES = {"desktop": DESKTOP, "phone": PHONE, "small": SMALL}
-PAGES = {"": ".card", "capture/vase": "section.panel", "run/runs%2Fvase": "h2", "run/runs%2Fheap": ".save"}
 
 
 def marked(test):
@@ -105,19 +104,19 @@ def result_of(browser, owner, size):  # noqa: F811
 @marked
 def test_one_click_makes_and_downloads_the_page_under_the_title(browser, folder):  # noqa: F811
     with served(folder) as (_, _, owner):
-        for title in ("Übung 1", "A cup & saucer", "heap"):
-            owner.ok("rename", key="runs/heap", title=title)
-            tab, bad, _ = result_of(browser, owner, DESKTOP)
-            with tab.expect_download() as download:
-                tab.click("button:has-text('Share')")
-            assert download.value.suggested_filename == f"{title}.html"
-            page = Path(download.value.path()).read_text()
-            assert "connect-src 'none'" in page and not bad
-            tab.wait_for_selector("button:has-text('Share'):not([disabled])")
-            tab.close()
+        title = "Übung & 1"
+        owner.ok("rename", key="runs/heap", title=title)
+        tab, bad, _ = result_of(browser, owner, DESKTOP)
+        with tab.expect_download() as download:
+            tab.click("button:has-text('Share')")
+        assert download.value.suggested_filename == f"{title}.html"
+        page = Path(download.value.path()).read_text()
+        assert "connect-src 'none'" in page and not bad
+        tab.wait_for_selector("button:has-text('Share'):not([disabled])")
+        tab.close()
 
 
-@pytest.mark.parametrize("button", ["Fill the window", "Rename", "All captures"])
+@pytest.mark.parametrize("button", ["Fill the window", "Rename"])
 @marked
 def test_keys_reach_the_result_while_a_button_has_the_focus(browser, folder, button):  # noqa: F811
     with served(folder) as (_, _, owner):
@@ -150,23 +149,7 @@ def test_a_question_mark_lists_the_keys_and_the_picture_alone_fills_the_window(b
         assert tab.evaluate("document.fullscreenElement.className") == "result" and not bad
 
 
-@marked
-def test_keys_that_are_typed_into_a_field_stay_there(browser, folder):  # noqa: F811
-    with served(folder) as (_, _, owner):
-        tab, _, stage = result_of(browser, owner, DESKTOP)
-        before = stage.evaluate(STATE)
-        tab.select_option("section.save select", "stl")
-        tab.focus("section.save input")
-        for keys in ("2", "5", "ArrowUp"):
-            tab.keyboard.press(keys)
-        tab.click("button:has-text('Rename')")
-        tab.keyboard.type("+l2")
-        assert tab.input_value("section.save input") and tab.input_value("dialog input") == "+l2"
-        now = stage.evaluate(STATE)
-        assert (now["lamp"], now["view"], now["shown"]) == (before["lamp"], before["view"], before["shown"])
-
-
-@pytest.mark.parametrize("width, height", [(390, 844), (360, 640), (412, 915), (1000, 640)])
+@pytest.mark.parametrize("width, height", [(360, 640), (1000, 640)])
 @marked
 def test_nothing_to_press_stands_before_the_model(browser, folder, width, height):  # noqa: F811
     with served(folder) as (_, _, owner):

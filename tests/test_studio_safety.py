@@ -267,25 +267,6 @@ def test_a_full_disk_is_a_sentence_to_a_phone_whose_file_goes_on_once_there_is_r
     assert (open_studio[0].folder.root / "vase" / "photos" / "late.jpg").read_bytes() == photo
 
 
-def test_a_capture_that_cannot_be_written_to_is_a_sentence_to_a_phone_and_loses_no_photo(
-    let_in, open_studio, monkeypatch
-):
-    def refuse(*_: object) -> None:
-        raise OSError(30, "Read-only file system")
-
-    _, owner, port, token = let_in
-    phone, photo = joined(port, token), jpeg(12)
-    address = phone.create("vase", "kept.jpg", len(photo)).headers["Location"]
-    with monkeypatch.context() as patch:
-        patch.setattr("capture.intake.parts.settle", refuse)
-        refused = phone.piece(address, 0, photo)
-        assert refused.status == 500 and b"can be written to" in refused.content
-        assert phone.raw("HEAD", address).status == 500  # nothing is missing of it, and yet it has not arrived
-    assert phone.raw("HEAD", address).headers["Upload-Offset"] == str(len(photo))
-    assert (open_studio[0].folder.root / "vase" / "photos" / "kept.jpg").read_bytes() == photo
-    assert "photos/kept.jpg" in [one["name"] for one in owner.get("/api/capture?key=vase")[1]["photos"]]
-
-
 def test_two_programs_that_ask_for_one_port_at_once_get_two():
     with sockets.free_socket("127.0.0.1", 8600) as one, sockets.free_socket("127.0.0.1", 8600) as other:
         assert one.getsockname() != other.getsockname()

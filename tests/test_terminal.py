@@ -41,17 +41,6 @@ def step(done: int, message: str = "level 1", **numbers: float) -> Progress:
     return Progress(0.0, 0.0, "solve", done, 60, None, message, numbers)
 
 
-def test_a_long_step_says_what_it_does_and_for_how_long():
-    screen = Screen()
-    screen.display(step(0, "carving"))
-    screen.wait(9)
-    assert screen.lines() == [
-        "Carving the first shape: 0 of 60, carving",
-        "Carving the first shape: 0 of 60, carving, 4 s so far",
-        "Carving the first shape: 0 of 60, carving, 8 s so far",
-    ]
-
-
 def test_no_more_than_the_promised_time_passes_without_a_line_however_steps_and_silence_alternate():
     screen = Screen()
     printed, seen = [0.0], 0

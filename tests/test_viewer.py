@@ -4,10 +4,8 @@ import fake_run
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
 
 from capture.errors import ReconstructionError
-from capture.photos.photo import encode_srgb
 from reconstruct.stored_run.ply import read_mesh, read_preview
 from viewer.display.layers import (
     FIRST_FOV,
@@ -49,16 +47,6 @@ def test_a_curve_with_gaps_is_drawn_through_them_and_never_at_zero():
     drawn = continued(seconds, np.array([nan, 4.0, nan, 1.0, 0.0]))
     assert drawn == pytest.approx([4.0, 4.0, 2.0, 1.0, 1.0])  # half-way in the logarithm; the ends go on level
     assert np.isnan(continued(seconds, np.full(5, nan))).all()
-
-
-def test_a_file_is_new_once_each_time_it_is_replaced(tmp_path):
-    follower = RunFollower(tmp_path)
-    assert not follower.changed("preview.ply")
-    (tmp_path / "preview.ply").write_text("one")
-    assert follower.changed("preview.ply") and not follower.changed("preview.ply")
-    (tmp_path / "other").write_text("two")
-    (tmp_path / "other").replace(tmp_path / "preview.ply")
-    assert follower.changed("preview.ply")
 
 
 def test_a_half_written_mesh_is_no_mesh(tmp_path):
@@ -164,16 +152,6 @@ def test_the_page_follows_a_run_from_nothing_to_the_way_to_its_stage(tmp_path, t
     page.choose_photo(4)
     np.testing.assert_allclose(page._lamp.handle.position, light_position(page._lights[4].light, page._scale))
     assert truth.calibration.lights[4].photo in page.controls._caption.content
-
-
-def test_photos_show_as_they_are_read_before_there_are_lights(tmp_path, truth, server):
-    page = Page(tmp_path, server)
-    (tmp_path / "thumbs").mkdir()
-    for count, name in enumerate(("a.jpg", "b.jpg", "c.jpg"), start=1):
-        Image.fromarray(encode_srgb(truth.stack.rgb[count])).save(tmp_path / "thumbs" / name)
-        page.refresh()
-        assert page.controls.photo_index() == count - 1 and name in page.controls._caption.content
-        assert page.controls._photo.image.shape == truth.stack.rgb[count].shape
 
 
 def test_a_damaged_file_does_not_end_the_page(tmp_path, truth, server):

@@ -1,7 +1,6 @@
 """Every attack here works against viser alone, or with one guard taken away: the tests say which, and try it."""
 
 import asyncio
-import gc
 import hmac
 import http.client
 import inspect
@@ -17,10 +16,9 @@ import pytest
 import viser
 import viser._viser
 import websockets
-from waiting import PATIENCE_S, wait_until
+from waiting import PATIENCE_S
 
 from reconstruct.run.bundle import without_paths
-from reconstruct.run_folder.cost import give_memory_back
 from viewer.page import guard, message_filter
 from viewer.page.guard import GuardedServer, is_loopback
 from viewer.page.message_filter import InvalidMessage, refuse_strange
@@ -364,33 +362,3 @@ def test_a_message_changes_the_value_of_a_control_and_nothing_else_about_it(monk
         closed = talk(asked.get_port(), update | {"updates": {"parent_container_id": "nowhere"}}, taken=is_changed)
         assert (closed, is_changed()) == ((REFUSED, False) if is_guarded else (101, True))
         slider._impl.parent_container_id = "root"  # so that the server can be taken down
-
-
-def break_off(port: int) -> None:
-    """Come as a page does, and leave with an error."""
-
-    async def conversation() -> None:
-        here = f"127.0.0.1:{port}"
-        spoken = [websockets.Subprotocol(f"viser-v{viser.__version__}")]
-        connection = await websockets.connect(
-            f"ws://{here}", origin=websockets.Origin(f"http://{here}"), subprotocols=spoken
-        )
-        await connection.recv()
-        await connection.close(1011)
-
-    asyncio.run(conversation())
-
-
-def is_let_go() -> bool:
-    give_memory_back()
-    return not any(type(one) is viser.ClientHandle for one in gc.get_objects())
-
-
-def test_a_visitor_who_breaks_off_is_let_go_when_memory_is_given_back(server):
-    gc.disable()  # as for hours, where few objects are made
-    try:
-        break_off(server.get_port())
-        wait_until(lambda: not server.get_clients())
-        wait_until(is_let_go)
-    finally:
-        gc.enable()
