@@ -82,7 +82,7 @@ def test_a_solve_that_was_stopped_has_a_surface_and_is_continued_bit_for_bit(tmp
         early, seen, steering = solve(scene, SMALL, run, {23: ["stop"]}, file)
         assert steering.was_stopped and seen[-1] == ("solve", 30)
         assert bool((early.grid.values < 0).any()) and early.evidence is not None
-        assert "continues from here" in _requests(run)[0]
+        assert "goes on from here" in _requests(run)[0]
     with RunFolder(tmp_path / "run") as run:
         assert not run.forgotten, "it has been followed"
         late, seen, steering = solve(scene, SMALL, run, {}, file)

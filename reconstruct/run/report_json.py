@@ -190,7 +190,7 @@ def _requests(run: RunFolder) -> list[str]:
     lines = read_log(run.file(LOG))
     last = max((i for i, line in enumerate(lines) if line.get("numbers")), default=-1)
     said = [(i, str(line["message"])) for i, line in enumerate(lines) if ON_REQUEST in str(line.get("message"))]
-    return [text for i, text in said if i > last or "continues from here" not in text]
+    return [text for i, text in said if i > last or "goes on from here" not in text]
 
 
 def _refined_lights(calibration: Calibration, solved: "Fields") -> list[dict[str, Any]]:
