@@ -10,10 +10,8 @@ import time
 import unicodedata
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 
 DEEP, LONG = 100_000, 100_000  # brackets within each other; digits of a number, files of a folder by a tenth
@@ -49,7 +47,6 @@ NAMES = (
     ),
     *("IMG_1.jpg\r\nSet-Cookie: a", "\x1b]0;title\x07", "%2e%2e%2fsecret", "~/.ssh/id", "file:///etc/passwd", "*"),
 )
-SHAPES = ([2**32, 2**32], [2**63], [-1, -1], [0] * 64, [1] * 2000, ["1"], [1.5], [True])
 CHANGING_S = 1.5  # for how long a file goes on changing
 
 
@@ -106,37 +103,6 @@ def by_names(draw: random.Random, run: Path) -> str:
     return f"{path.name}: the name {name!r:.40}"
 
 
-def by_layout(draw: random.Random, run: Path) -> str:
-    """A header of tensors that lies: places that overlap or lie beyond the file, sizes that no number holds."""
-    path = run / draw.choice(TENSORS)
-    data = path.read_bytes()
-    (length,) = struct.unpack("<Q", data[:8])
-    header = json.loads(data[8 : 8 + length])
-    tensors = [name for name in header if name != "__metadata__"]
-    name, other = draw.choice(tensors), draw.choice(tensors)
-    way = draw.choice(["overlap", "beyond", "shape", "negative", "type", "twice", "spaces", "many", "texts", "hole"])
-    if way in ("overlap", "beyond", "negative"):
-        places = {"overlap": header[other]["data_offsets"], "beyond": [0, 2**63 - 1], "negative": [-8, 8]}
-        header[name]["data_offsets"] = places[way]
-    elif way == "shape":
-        header[name]["shape"] = draw.choice(
-            [[2**32, 2**32], [2**63], [-1, -1], [0] * 64, [1] * 2000, ["1"], [1.5], [True]]
-        )
-    elif way == "type":
-        header[name]["dtype"] = draw.choice(["F64", "BOOL", "F8_E4M3", "I64", "X", "", None, 1])
-    elif way == "many":
-        header |= {f"t{i}": {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]} for i in range(LONG // 10)}
-    elif way == "texts":
-        header["__metadata__"] = {str(i): "x" * 100 for i in range(LONG // 10)}
-    text = json.dumps(header).encode()
-    if way == "twice":
-        text = text[:-1] + b", " + json.dumps(name).encode() + b": " + json.dumps(header[other]).encode() + b"}"
-    elif way == "spaces":
-        text += b" " * 10_000_000
-    path.write_bytes(struct.pack("<Q", len(text)) + text + data[8 + length :] + (b"\0" * 64 if way == "hole" else b""))
-    return f"{path.name}: {name} {way}"
-
-
 def _lying(draw: random.Random, way: str, data: bytearray) -> bytes:
     """An archive whose directory says what is not so."""
     end = data.rfind(b"PK\x05\x06")
@@ -186,38 +152,6 @@ def by_archive(draw: random.Random, run: Path) -> str:
     lies = ("cut", "count", "sizes", "comment", "encrypted")
     path.write_bytes(_lying(draw, way, bytearray(whole)) if way in lies else file.getvalue())
     return f"stage.zip: {way}"
-
-
-@cache
-def _packed_zeros(size: int) -> bytes:
-    return zlib.compress(bytes(size), 1)
-
-
-def by_picture_header(draw: random.Random, run: Path) -> str:
-    """A PNG or JPEG that says it is huge, empty, of sixteen bits, or that unpacks to a gigabyte."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-    path = draw.choice([run / "mask.png", *sorted((run / "thumbs").glob("*.jpg"))])
-    way = draw.choice(["huge", "empty", "deep", "profile", "text", "chunk", "frames", "jpeg", "marker"])
-    size = {"huge": (2**31 - 1, 2**31 - 1), "empty": (0, 0)}.get(way, (64, 48))
-    head = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", *size, 16 if way == "deep" else 8, 0, 0, 0, 1))
-    bomb = _packed_zeros(100 << 20)
-    extra = {
-        "profile": chunk(b"iCCP", b"a\0\0" + bomb),
-        "text": chunk(b"zTXt", b"a\0\0" + bomb) * 5,
-        "chunk": struct.pack(">I", 2**31 - 1) + b"IDAT",
-        "frames": chunk(b"acTL", struct.pack(">II", 2**31 - 1, 0)),
-    }.get(way, b"")
-    data = head + extra + chunk(b"IDAT", zlib.compress(bytes(65 * 48))) + chunk(b"IEND", b"")
-    if way == "jpeg":
-        frame = b"\xff\xc0\x00\x11\x08\xff\xdc\xff\xdc\x03\x01\x22\x00\x02\x11\x01\x03\x11\x01"
-        data = b"\xff\xd8" + frame + b"\xff\xda\x00\x0c\x03\x01\x00\x02\x11\x03\x11\x00\x3f\x00" + bytes(5000)
-    elif way == "marker":
-        data = b"\xff\xd8" + b"\xff\xe1\xff\xffExif\0\0II*\0\x08\0\0\0\xff\xff" * 200
-    path.write_bytes(data)
-    return f"{path.name}: {way}"
 
 
 def by_company(draw: random.Random, run: Path) -> str:
@@ -272,5 +206,5 @@ def by_change(draw: random.Random, run: Path) -> str:
 
 
 STRANGE: tuple[Callable[[random.Random, Path], str], ...] = (
-    *(by_text, by_text, by_names, by_layout, by_layout, by_archive, by_picture_header, by_company, by_change),
+    *(by_text, by_text, by_names, by_archive, by_company, by_change),
 )
