@@ -8,9 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from examples.generator import poses
-from examples.generator.shapes import build
-
 FOLDER = Path(__file__).parent.parent / "benchmarks"
 SEEDS = (1, 77, 1003)
 
@@ -72,28 +69,6 @@ def test_a_draw_follows_from_its_seed_and_lies_in_the_stated_ranges(bench, kind)
     assert len(keys) == 63
 
 
-@pytest.mark.parametrize("kind", ["close", "far"])
-def test_thing_and_board_are_whole_in_their_photos_and_no_flashlight_is(bench, kind):
-    parse_board = importlib.import_module("calibration.board.board").parse_board
-    for seed in (*SEEDS, 5, 9, 12):
-        setup = bench("bed_draws").draw(seed, kind, []).setup
-        board = parse_board(setup.table.board)
-        thing = poses.stand(build(setup.thing.shape, 24), setup, board)
-        fixed = poses.tripod(setup, board, thing)
-        lamps = poses.lamps(setup, setup.flashlight.photos, thing, board, np.random.default_rng(0))
-
-        def pixels(points, view=fixed):
-            local = view.world_from_camera.inverse().apply(points)
-            return np.where(local[:, 2:] > 0, view.camera.project(local), -1e6)
-
-        def inside(found, camera=fixed.camera):
-            return ((found > 0) & (found < [camera.width - 1, camera.height - 1])).all(1)
-
-        assert inside(pixels(np.array(thing.vertices))).all(), f"{kind} {seed}: the thing is cut"
-        assert inside(pixels(board.points())).all(), f"{kind} {seed}: the board is cut"
-        assert not inside(pixels(np.array([lamp.position for lamp in lamps]))).any()
-
-
 @pytest.mark.parametrize(
     ("outcome", "causes"),
     [("success", []), ("honest", ["lights"]), ("confident wrong", ["outline"]), ("another cause", ["outline"])],
@@ -133,13 +108,6 @@ def test_intervals_are_wilsons_and_hold_the_truth_as_often_as_they_say(bench):
         low, high = map(float, bed.interval(values, np.mean).partition("(")[2].rstrip(")").split(" to "))
         held += low <= 5.0 <= high
     assert held >= 34
-
-
-def test_pairs_are_of_the_same_captures(bench):
-    a = rows(bench, *((seed, "confident wrong", 100.0) for seed in range(12)))
-    b = rows(bench, *((seed, "success", 50.0) for seed in range(4, 16)))
-    line = list(bench("bed").compared(a, b)[0].values())
-    assert line == ["all", 8, "1 (1 to 1)", "0 (0 to 0)", "-1 (-1 to -1)", "0.5 (0.5 to 0.5)"]
 
 
 @pytest.mark.parametrize("seed", [1000, 1001, 5000])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from calibration.board.board import Board, parse_board
 from calibration.board.board_pose import board_views, fit_ground
 from calibration.board.corners import Corners, find_board
-from calibration.board.recognise import _layout, guess_board
+from calibration.board.recognise import guess_board
 from calibration.camera import Camera
 from capture.errors import CalibrationError
 
@@ -143,19 +143,6 @@ def test_an_unnamed_board_is_recognised_and_its_millimetres_called_assumed():
     assert (charuco.board.columns, charuco.board.rows, charuco.board.dictionary) == (5, 7, "DICT_4X4_50")
     assert (checker.board.columns, checker.board.rows) == (9, 6)
     assert "assumed" in charuco.note and "assumed" in checker.note
-
-
-@pytest.mark.parametrize("n_false", [0, 4])
-def test_columns_and_markers_are_told_though_some_markers_are_false(n_false):
-    rng = np.random.default_rng(5)
-    cells = np.array([(u, v) for v in range(7) for u in range(5) if (u + v) % 2], float)
-    squares = 0.73 * (np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) - 0.5)
-    view = np.array([[60.0, 8.0, 200.0], [-5.0, 45.0, 150.0], [0.01, 0.02, 1.0]])
-    corners = cv2.perspectiveTransform((cells[:, None] + squares).reshape(1, -1, 2), view).reshape(-1, 4, 2)
-    corners[rng.choice(len(cells), n_false, replace=False)] += rng.uniform(100, 300, (n_false, 1, 2))
-    layout = _layout(np.arange(len(cells)), corners)
-    assert layout is not None and layout.columns == 5
-    assert layout.ratio == pytest.approx(0.73, abs=0.01)
 
 
 # --- pose

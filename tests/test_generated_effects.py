@@ -44,21 +44,6 @@ def never(start: np.ndarray, along: np.ndarray) -> np.ndarray:
     return np.zeros(len(along), bool)
 
 
-def test_flashlights_stay_before_the_wall_and_hand_held_phones_too():
-    setup = Setup(table=Table(wall=340.0), further=Further(side_photos=5))
-    thing, fixed = scene(setup)
-    wall = poses.wall_of(setup, thing)
-    assert wall is not None and not wall.hides(fixed.world_from_camera.translation)
-    found = poses.lamps(setup, 40, thing, BOARD, np.random.default_rng(0))
-    assert len(found) == 40 and not any(wall.hides(lamp.position) for lamp in found)
-    views = poses.handheld(fixed, BOARD, setup, np.random.default_rng(0))
-    views += poses.sides(fixed, BOARD, thing, setup, never)
-    assert not any(wall.hides(view.world_from_camera.translation) for view in views)
-    with pytest.raises(CaptureError, match="no place"):
-        far = replace(setup, flashlight=Flashlight(around=(170.0, 190.0), height=(5.0, 10.0)))
-        poses.lamps(far, 4, thing, BOARD, np.random.default_rng(0))
-
-
 def test_side_views_hold_object_and_board():
     setup = Setup(further=Further(side_photos=4))
     thing, fixed = scene(setup)

@@ -1,7 +1,6 @@
 """Generated captures: the renderer, the truth beside it and the formulas agree."""
 
 import json
-from typing import Any
 
 import cv2
 import numpy as np
@@ -11,9 +10,7 @@ from scipy.spatial import cKDTree
 
 from calibration.board.board import parse_board
 from calibration.board.corners import find_board
-from calibration.calibration import Calibration, save_calibration
 from calibration.camera import Camera
-from calibration.light import Light
 from calibration.pose import Pose
 from capture.decode.exif import read_header
 from capture.errors import CaptureError
@@ -22,7 +19,6 @@ from capture.session.session import load_session
 from examples.generator.lens import lens_of
 from examples.generator.options import Around, Exposure, Flashlight, Further, Phone, Setup, Table, Thing
 from examples.generator.shapes import build
-from reconstruct.evaluate.metrics import evaluate
 
 BOARD = "checkerboard:5x4:36"
 
@@ -150,29 +146,6 @@ def test_the_capture_reads_as_a_session_and_the_moved_photo_is_marked(capture):
     assert usable == [True, False, True, True, True]
     header = read_header(session.lit[0])
     assert header.exposure.iso == 250 and header.taken_s is not None
-
-
-@pytest.mark.slow
-def test_the_truth_scores_perfectly_against_itself(capture, tmp_path):
-    camera, ground = truth(capture, "camera")["stored"], truth(capture, "ground")
-    with np.load(capture / "gt" / "maps.npz") as maps:
-        depth, normal, mask = maps["depth_mm"], maps["normal"].astype(np.float32), maps["mask"]
-    np.save(tmp_path / "depth.npy", np.where(mask, depth, np.inf))
-    np.save(tmp_path / "normal.npy", normal)
-    cv2.imwrite(str(tmp_path / "mask.png"), np.where(mask, 255, 0).astype(np.uint8))
-    trimesh.load(capture / "gt" / "object.ply").export(tmp_path / "mesh.ply")
-    pose = Pose.from_matrix(np.linalg.inv(np.array(camera["T_cam_from_board"])))
-    (fx, _, cx), (_, fy, cy), _ = camera["K"]
-    lights = tuple(
-        Light(entry["file"], "point", np.array(entry["position_mm"]), used=entry["usable"])
-        for entry in truth(capture, "lights")["photos"]
-    )
-    seen = Camera(320, 240, fx, fy, cx, cy, tuple(camera["dist_k1_k2_p1_p2_k3"]))
-    save_calibration(Calibration(seen, pose, ground["offset_mm"], lights), tmp_path / "calibration.json")
-    scores: dict[str, Any] = evaluate(tmp_path, capture)
-    assert scores["mask_iou"] == 1 and scores["normal_mae_deg"] < 0.1
-    assert scores["depth_mae_mm"] < 1e-3 and scores["light_median_pct"] < 1e-6
-    assert scores["fscore_2pct"] > 0.99
 
 
 @pytest.mark.slow

@@ -88,35 +88,6 @@ def waves(height_mm: float) -> np.ndarray:
     return EYE_MM - height_mm * (1 + np.sin(2 * u + 0.5) * np.cos(1.5 * v)) / 2
 
 
-def one_ray(heights, undersides, light, i=2, j=2):
-    tops = np.empty([-(-n // height_kernels.TILE) for n in heights.shape], np.float32)
-    height_kernels.tile_tops(heights, tops)
-    frame = (50.0, 10.0, 20.0, 20.0, 4)
-    field = (heights, undersides, tops)
-    return height_kernels._ray(field, tops.max(), i, j, heights[i + 4, j + 4], light, frame, 1.0)
-
-
-def test_a_light_ray_is_a_straight_line_over_the_field():
-    """The margin over a single peak is that of the ray in space, found by projecting its points."""
-    heights, solid = np.zeros((48, 48), np.float32), np.full((48, 48), -1e6, np.float32)
-    light = np.array([6.0, -3.6, -4.0, 1.0])  # camera axes: on the row of the peak and pixel (2, 2), above the camera
-    focal, reference, centre = 50.0, 10.0, 20.0
-    light[1] = (2 - centre) / focal * light[2]  # no motion across rows: fLy = (i - c) Lz
-    start = np.array([(2 - centre) / focal, (2 - centre) / focal, 1.0]) * reference
-    t = np.linspace(0, 1, 200001)[1:]
-    points = start + t[:, None] * (light[:3] - start)
-    before = points[:, 2] > 1e-3
-    columns = focal * points[before, 0] / points[before, 2] + centre + 4
-    k = np.abs(columns - 16).argmin()
-    height = focal * (reference / points[before][k, 2] - 1)
-    rise = height / (16 - 6)
-    heights[6, 16] = peak = np.float32(0.95 * height)
-    margin, place, x, y, _, beneath = one_ray(heights, solid, light)
-    assert place == 10 and (x, y) == (16, 6) and not beneath
-    scale = np.clip(rise, height_kernels.FLATTEST, height_kernels.STEEPEST)
-    assert margin == pytest.approx((height - peak) / scale, rel=0.01)
-
-
 def test_the_gradient_of_the_heights_is_that_of_the_error():
     """Against central differences of the loss sum log-likelihood / s, in a field without ties."""
     rng = np.random.default_rng(3)
