@@ -7,7 +7,7 @@ from board_photos import board_photo, corners_of, look_at, slanted
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.board.board import Board, parse_board
+from calibration.board.board import Board, opencv_dictionary, parse_board
 from calibration.board.board_pose import board_views, fit_ground
 from calibration.board.corners import Corners, find_board
 from calibration.board.recognise import guess_board
@@ -143,6 +143,16 @@ def test_an_unnamed_board_is_recognised_and_its_millimetres_called_assumed():
     assert (charuco.board.columns, charuco.board.rows, charuco.board.dictionary) == (5, 7, "DICT_4X4_50")
     assert (checker.board.columns, checker.board.rows) == (9, 6)
     assert "assumed" in charuco.note and "assumed" in checker.note
+
+
+def test_a_false_marker_beside_the_board_adds_no_rows():
+    photo = board_photo(CHARUCO, CAMERA, POSE)
+    marker = cv2.aruco.generateImageMarker(opencv_dictionary("DICT_4X4_1000"), 609, 48)
+    photo[4:88, 4:88] = 255
+    photo[20:68, 20:68] = marker
+    guess = guess_board([photo])
+    assert guess is not None and guess.board.spec().startswith("charuco:5x7:")
+    assert guess.board.dictionary == "DICT_4X4_50"
 
 
 # --- pose

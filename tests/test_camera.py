@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from board_photos import corners_of, slanted
+from board_photos import corners_of, look_at, slanted
 
 from calibration.board.board import parse_board
 from calibration.board.corners import Corners
@@ -25,6 +25,19 @@ CAMERA = Camera(*SIZE, 1150.0, 1150.0, 605.0, 446.0, (0.05, -0.06, 0.0, 0.0, 0.0
 def views(camera, n, rng, noise_px=0.1):
     tilts = rng.uniform(0.4, 0.9, n)
     return [corners_of(BOARD, camera, slanted(rng, tilt), noise_px, rng) for tilt in tilts]
+
+
+def test_the_centre_of_the_first_pixel_is_zero():
+    assert np.array_equal(Camera(4, 2, 1.0, 1.0, 1.5, 0.5).pixel_grid()[0, 0], [0, 0])
+
+
+def test_resized_agrees_with_what_opencv_does_to_a_ramp():
+    ramp = np.tile(np.arange(64, dtype=np.float32), (48, 1))
+    small = cv2.resize(ramp, (32, 24), interpolation=cv2.INTER_AREA)
+    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+    point = np.array([0.08, 0.0, 1.0])  # seen at column 35.5 of the ramp
+    u = camera.resized(32, 24).project(point)[0]
+    assert np.interp(u, np.arange(32), small[12]) == pytest.approx(camera.project(point)[0], abs=1e-6)
 
 
 def test_the_stated_sigma_of_one_oblique_photo_is_the_spread_of_its_focal_length():
@@ -53,6 +66,13 @@ def test_exif_of_another_zoom_is_dropped_and_said():
     fit = fit_camera(detections, SIZE, 1.4 * FOCAL_35MM)
     assert abs(fit.camera.fx / CAMERA.fx - 1) < 0.01
     assert any("EXIF" in note for note in fit.notes)
+
+
+def test_right_exif_helps_a_photo_from_straight_above():
+    above = corners_of(BOARD, CAMERA, look_at((75, -110, 550)), 0.1, np.random.default_rng(5))
+    fit = fit_camera([above], SIZE, FOCAL_35MM)
+    assert abs(fit.camera.fx / CAMERA.fx - 1) < 0.05
+    assert any("focal length" in note for note in fit.notes)
 
 
 def test_no_photo_of_a_board_is_refused():

@@ -1,3 +1,4 @@
+import warnings
 from dataclasses import replace
 
 import cv2
@@ -6,6 +7,7 @@ import numpy as np
 import pytest
 
 from capture.checks.check_stack import check_stack
+from capture.checks.robust import column_quantile
 
 N = 12
 
@@ -87,6 +89,15 @@ def test_hands_in_a_third_of_the_photos_are_found(eighteen):
     assert dropped(findings) == [(f"IMG_{k}.jpg", "covered") for k in hands]
 
 
+def test_a_highlight_of_the_table_covers_nothing(eighteen):
+    """It washes the grain out over 4 % of the picture, but falls off without an edge."""
+    v, u = np.mgrid[: lit_table.HEIGHT, : lit_table.WIDTH]
+    rgb = eighteen.rgb.copy()
+    glow = 0.75 * np.exp(-((u - 80) ** 2 + (v - 190) ** 2) / (2 * 22**2))
+    rgb[4] = rgb[4] * (1 - glow[..., None] / 0.8) + glow[..., None].astype(np.float32)
+    assert check_stack(replace(eighteen, rgb=rgb.astype(np.float32))) == ()
+
+
 def test_on_a_table_without_texture_nothing_is_said_about_blur_and_motion():
     rng = np.random.default_rng(2)
     plain = lit_table.stack_of(lit_table.lit_photos(N, rng, np.full((lit_table.HEIGHT, lit_table.WIDTH), 0.4)))
@@ -149,3 +160,14 @@ def test_room_light_in_all_photos_is_told_of_each(stack):
     bright = replace(bright, rgb=bright.rgb + light)
     found = [finding for finding in check_stack(bright) if finding.kind == "ambient light"]
     assert len(found) == N and not any(finding.drop for finding in found)
+
+
+def test_quantiles_of_columns_are_numpys_also_with_gaps_and_without_values():
+    values = np.random.default_rng(4).normal(size=(9, 200))
+    values[np.random.default_rng(5).random(values.shape) < 0.4] = np.nan
+    values[:, 7], values[1:, 8] = np.nan, np.nan
+    for share in (0.0, 0.6, 0.75, 1.0):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the column without values
+            expected = np.nanquantile(values, share, axis=0)
+        np.testing.assert_allclose(column_quantile(values, share), expected, rtol=1e-12)

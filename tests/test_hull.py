@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import label
-from synthetic import BALL, HEAP, Box, Look, default_camera, render
+from synthetic import BALL, HEAP, Box, Look, Sphere, default_camera, render
 
 from calibration.camera import Camera
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.side_view import SideView
 from capture.errors import ReconstructionError
+from reconstruct.hull.hull_parts import PixelRays, most_needed
 from reconstruct.hull.shadow_hull import shadow_hull
 from reconstruct.labels.labels import assemble_labels
 
@@ -98,3 +99,22 @@ def test_few_lights_leave_no_floating_parts_between_camera_and_object(lights):
     distance = truth.sdf(nodes.reshape(-1, 3)).reshape(inside.shape)
     assert inside[(distance < -2.5 * grid.spacing) & (nodes[..., 2] > 0)].mean() > 0.95  # the object is still in it
     assert grid.spacing < 5  # mm: its box is not that of what floats, which was twice as long
+
+
+@pytest.mark.parametrize(("rows", "needs"), [(4, 2), (1, 1)])
+def test_where_object_pixels_meet_hardly_any_node_that_enough_lights_need_fewer_are_enough(rows, needs):
+    inside, needed = np.ones((12, 12, 12), bool), np.ones((12, 12, 12), np.uint8)
+    needed[:, : 3 * rows : 3] = 2  # a pixel meets these rows and their neighbours
+    nodes = np.arange(12**3, dtype=np.int32).reshape(12, 144)  # one ray through each node of the first layer
+    rays = PixelRays(nodes, np.ones(nodes.shape, bool), np.arange(12, dtype=np.float32), np.arange(144))
+    enough, keep = most_needed(inside, needed, inside, 2, [rays])
+    assert enough == needs and keep.sum() == (needed >= needs).sum()
+    assert not rays.meet(np.zeros_like(inside)).any()
+
+
+def test_a_hanging_object_that_pixels_need_stays():
+    pair = (Sphere((-50.0, 0.0, 25.0), 25.0), Sphere((50.0, 0.0, 90.0), 20.0))
+    scene, _ = render(pair, LOOK)
+    grid = shadow_hull(scene, labels_of(scene), votes=1, nodes=48)
+    for ball in pair:
+        assert float(grid.sdf(torch.tensor([ball.centre]))) < 0

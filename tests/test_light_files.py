@@ -11,7 +11,7 @@ import scipy.io
 from flashlight_photos import CAMERA, POSED_CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights, photograph
 
 from calibration.calibrate_with_file import with_opinions
-from calibration.calibration import Calibration
+from calibration.calibration import Calibration, save_calibration
 from calibration.lights.files import read_lights, read_opinions
 from calibration.lights.layouts import BLENDER
 from calibration.lights.power import SHADING_MISFIT, with_power_per_photo
@@ -73,6 +73,17 @@ def test_shadowneus_real_photos_are_placed_by_their_camera_and_floor(tmp_path):
     np.testing.assert_allclose(places(read_lights(file, PHOTOS, POSED_CAMERA)), PLACES, atol=1e-6)
 
 
+def test_s3nerf_looks_along_minus_z_and_numbers_its_photos(tmp_path):
+    file = tmp_path / "params.json"
+    lights = np.zeros((9, 3))
+    lights[[1, 3, 4, 8]] = ELSEWHERE.apply(PLACES)
+    pose = (ELSEWHERE @ WORLD_FROM_CAMERA).matrix() @ np.diag([1.0, -1, -1, 1])
+    file.write_text(json.dumps({"light_pos": lights.tolist(), "pose_c2w": pose.tolist()}))
+    photos = ["ld_002.png", "ld_004.png", "ld_005.png", "ld_009.png"]
+    given = read_lights(file, photos, POSED_CAMERA)
+    np.testing.assert_allclose(np.array([x.position for x in given.lights]), PLACES, atol=1e-6)
+
+
 @pytest.mark.parametrize("kind", ["point", "directional"])
 def test_shadowneus_scenes_are_placed_by_their_camera(tmp_path, kind):
     frames = []
@@ -95,6 +106,23 @@ def test_shadowneus_scenes_are_placed_by_their_camera(tmp_path, kind):
         assert_towards_the_lights(given)
     else:
         np.testing.assert_allclose(places(given), PLACES, atol=1e-6)
+
+
+def test_our_own_calibration_comes_back_with_beam_and_power(tmp_path):
+    file = tmp_path / "calibration.json"
+    save_calibration(Calibration(CAMERA, WORLD_FROM_CAMERA, 0.0, LIGHTS, beam=(2.0, 0.1)), file)
+    given = read_lights(file, PHOTOS[1:], POSED_CAMERA)
+    assert given.has_power and given.beam == (2.0, 0.1)
+    np.testing.assert_array_equal(given.lights[0].axis, LIGHTS[1].axis)
+
+
+def test_a_plain_list_may_give_several_lights_to_a_photo(tmp_path):
+    file = tmp_path / "lights.json"
+    rows = [{"photo": PHOTOS[0], "position": [0, 0, 500]}, {"photo": PHOTOS[0], "direction": [0, 3, 4]}]
+    file.write_text(json.dumps({"lights": rows}))
+    given = read_lights(file, PHOTOS[:1], POSED_CAMERA)
+    assert [light.kind for light in given.lights] == ["point", "directional"]
+    np.testing.assert_allclose(given.lights[1].direction, [0, 0.6, 0.8])
 
 
 def test_a_list_with_sigmas_is_weighed_against_what_the_photos_say(tmp_path):

@@ -70,6 +70,16 @@ def test_the_ground_cuts_the_object_flat_and_closes_it():
     assert (mesh.vertex_normals[mesh.vertices[:, 2] < 1e-6][:, 2] < 0).all()
 
 
+def test_a_cut_between_nodes_is_where_the_ball_crosses_the_ground_and_its_inside_faces_down():
+    height = 8.3  # nodes lie 0.3 of a voxel above the ground; the ball widens by 1.5 voxels per voxel there
+    mesh = extract_mesh(solved(sphere_grid(height)))
+    on_ground = mesh.vertices[:, 2] < 1e-6
+    away = np.linalg.norm(mesh.vertices[on_ground, :2], axis=1)
+    assert away.max() == pytest.approx(np.sqrt(RADIUS**2 - height**2), abs=0.1)
+    inner = mesh.vertex_normals[on_ground][away < 3]
+    np.testing.assert_allclose(inner, np.tile([0.0, 0.0, -1.0], (len(inner), 1)), atol=1e-6)
+
+
 def test_an_object_that_leaves_the_box_is_closed_at_its_walls():
     grid = sphere_grid(height=20)
     cut = SdfGrid(grid.values[8:], grid.origin + torch.tensor([8.0, 0, 0]), 1.0)
@@ -121,6 +131,14 @@ def test_empty_space_is_refused_with_a_sentence():
 def test_too_fine_a_grid_is_refused_with_its_numbers():
     with pytest.raises(ReconstructionError, match=r"0.00926 million nodes.*at most 0.001 million"):
         extract_mesh(solved(sphere_grid(height=20)), max_nodes=1000)
+
+
+def test_a_preview_is_coarser_and_closed():
+    grid = sphere_grid(height=20, spacing=0.5)
+    preview = preview_mesh(grid, 0.0, max_nodes=20**3)
+    assert preview is not None and preview.is_watertight
+    assert len(preview.faces) < 0.2 * len(extract_mesh(solved(grid)).faces)
+    assert preview.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.1)
 
 
 def test_a_preview_has_the_colours_of_the_photos_and_behind_those_of_the_nearest_that_are_seen():

@@ -15,7 +15,7 @@ from calibration.light import Light
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from reconstruct.evaluate.metrics import evaluate
-from reconstruct.evaluate.surface_distance import hidden_from, register, seen_from
+from reconstruct.evaluate.surface_distance import hidden_from, nmze, register, seen_from
 
 SIDE, FOCAL = 80, 150.0
 SAMPLES = 10_000  # on each surface: a tenth of the real measure, for speed
@@ -103,6 +103,16 @@ def test_a_mesh_without_its_back_loses_what_the_camera_cannot_see(scene, tmp_pat
     assert numbers["visible_recall"] > 0.97
     assert numbers["hidden_recall"] < 0.3
     assert numbers["depth_l1_raw"] < 1e-3
+
+
+def test_one_wild_pixel_rules_the_plain_nmze_and_not_the_trimmed_one():
+    truth = np.linspace(1, 2, 1000)
+    wild = truth.copy()
+    wild[500] = 3.0
+    assert nmze(truth, truth) == 0
+    assert nmze(3 * truth + 1, truth) == pytest.approx(0, abs=1e-12)
+    assert nmze(wild, truth) == pytest.approx(0.25, abs=0.01)
+    assert nmze(wild, truth, trim=1.0) < 0.01
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.1])

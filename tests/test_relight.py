@@ -107,6 +107,13 @@ def test_unshadowed_ground_obeys_the_inverse_square_law_and_the_ambient_term(vie
     assert np.allclose(picture[-1, 0].numpy(), expected, rtol=1e-4)
 
 
+def test_a_beam_is_dimmer_off_its_axis(view):
+    straight = Light("p", "point", np.array([0.0, 0.0, 3.0]), axis=np.array([0.0, 0.0, -1.0]))
+    ratio = relight(view, straight, (2.0,))[-1, 0] / relight(view, straight)[-1, 0]
+    towards = np.array([0.0, 0.0, 3.0]) - view.maps.points[-1, 0].double().numpy()
+    assert torch.allclose(ratio, torch.tensor((towards[2] / np.linalg.norm(towards)) ** 2).float(), rtol=1e-4)
+
+
 def fields_rest() -> tuple:
     return torch.full((48, 64, 3), 0.5), CAMERA, POSE, 0.0, "scene"
 

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from calibration.calibration import save_calibration
 from reconstruct.check.light_coverage import widest_gap
-from viewer.report.drawing import difference_picture, mesh_picture
+from reconstruct.run_folder.folder import RunFolder
+from viewer.report.drawing import difference_picture, mesh_picture, normal_picture, reduced
 from viewer.report.figures import curves, lights_from_above
 from viewer.report.pictures import guess_facts, mesh_pictures
 from viewer.report.report import write_report
@@ -108,6 +110,16 @@ def test_a_run_that_stopped_early_says_where_and_why(tmp_path, truth):
     assert "The run stopped: board found in 0 of 4 photos" in Reader(page_of(tmp_path)).text
 
 
+def test_a_run_that_stopped_early_says_what_its_finished_stages_cost(tmp_path, truth):
+    fake_run.start_run(tmp_path, truth)
+    with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path) as run:
+        run.claim({}, {})
+        with run.stage("calibrate"):
+            pass
+        raise KeyboardInterrupt
+    assert "Finding camera and lights" in Reader(page_of(tmp_path)).text
+
+
 def test_an_empty_folder_gets_a_report_too(tmp_path):
     assert "There is no mesh" in Reader(page_of(tmp_path)).text
 
@@ -122,6 +134,14 @@ def test_a_damaged_file_is_named_and_the_rest_is_shown(tmp_path, truth, name):
     assert name in text or "depth.npy" in text
 
 
+def test_a_scene_in_its_own_unit_is_not_given_in_millimetres(tmp_path, truth):
+    fake_run.start_run(tmp_path, truth)
+    fake_run.finish_run(tmp_path, truth)
+    save_calibration(replace(fake_run.calibration_of(truth), unit="scene"), tmp_path / "calibration.json")
+    (tmp_path / "report.json").unlink()
+    assert " mm" not in Reader(page_of(tmp_path)).text.replace(" mm away", "")
+
+
 # --- pictures --------------------------------------------------------------------------------------------------------
 
 
@@ -133,12 +153,31 @@ def test_the_picture_of_a_ball_covers_a_disc_and_is_brighter_where_the_light_com
     assert picture[30, 50, 0] > picture[50, 70, 0] + 40
 
 
+def test_the_nearer_surface_hides_the_farther_one():
+    near, far = trimesh.creation.box((2, 2, 2)), trimesh.creation.box((8, 8, 2))
+    near.apply_translation((0, -10, 0))
+    near.visual.vertex_colors, far.visual.vertex_colors = [255, 0, 0, 255], [0, 0, 255, 255]
+    picture = mesh_picture(trimesh.util.concatenate([far, near]), np.array([0.0, -1.0, 0.001]), (100, 100), reach=5.0)
+    assert picture[50, 50, 0] > 100 and picture[50, 50, 2] == 0
+    assert picture[50, 80, 2] > 100 and picture[50, 80, 0] == 0
+
+
+def test_a_normal_towards_the_sky_is_blue():
+    picture = normal_picture(np.array([[[0.0, 0.0, 1.0]]]), np.array([[True]]))
+    assert picture[0, 0].tolist() == [128, 128, 255, 255]
+
+
 def test_a_brighter_photo_is_red_a_darker_one_blue_and_an_equal_one_grey():
     photo = np.full((1, 3, 3), 100, np.uint8)
     computed = np.array([[[40] * 3, [160] * 3, [100] * 3]], np.uint8)
     red, blue, grey = difference_picture(photo, computed)[0].astype(int)
     assert red[0] > red[2] + 100 and blue[2] > blue[0] + 100
     assert np.ptp(grey) == 0
+
+
+def test_pictures_are_made_smaller_and_never_larger():
+    assert reduced(np.zeros((300, 400, 3), np.uint8), 100).shape == (75, 100, 3)
+    assert reduced(np.zeros((30, 40, 3), np.uint8), 100).shape == (30, 40, 3)
 
 
 # --- drawings --------------------------------------------------------------------------------------------------------

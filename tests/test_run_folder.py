@@ -12,7 +12,7 @@ import pytest
 
 from capture.errors import UserError
 from capture.files.atomic import atomic_file, write_json
-from reconstruct.run_folder.folder import RunFolder, read_log
+from reconstruct.run_folder.folder import RunFolder, content_hash, read_log
 from reconstruct.run_folder.once import ResultFile, once
 from reconstruct.run_folder.progress import told
 
@@ -25,6 +25,19 @@ def test_a_file_whose_writing_fails_keeps_its_old_content_and_leaves_nothing_bes
         raise ValueError
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["mesh.ply"]
+
+
+def test_a_number_that_is_not_one_is_refused_in_json(tmp_path):
+    with pytest.raises(ValueError):
+        write_json(tmp_path / "a.json", {"a": float("nan")})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failing_run_leaves_no_folder_where_there_was_none(tmp_path):
+    with pytest.raises(UserError), RunFolder(tmp_path / "out") as run:
+        run.progress(message="looking")
+        raise UserError("nothing here")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_failing_run_leaves_what_others_put_into_its_folder(tmp_path):
@@ -103,6 +116,14 @@ def test_a_stage_is_noted_with_the_versions_it_was_made_with_and_others_continue
     manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
     assert manifest["made_with"] == {"calibrate": {"torch": "1"}, "solve": {"torch": "2"}}
     assert manifest["inputs"] == {"photos/a.jpg": "1"} and manifest["config"] == {"seed": 3}
+
+
+def test_a_capture_that_moved_is_the_same_capture(tmp_path):
+    for place in ("here", "there"):
+        (tmp_path / place / "photos").mkdir(parents=True)
+        (tmp_path / place / "photos" / "a.jpg").write_bytes(b"light")
+    here, there = (content_hash([tmp_path / p / "photos" / "a.jpg"]) for p in ("here", "there"))
+    assert here == there and list(here) == ["photos/a.jpg"]
 
 
 def test_a_stage_is_charged_with_the_cpu_time_and_memory_it_used(tmp_path):
