@@ -7,15 +7,17 @@ import pytest
 import relief_ball
 import torch
 
+import capture.photos.photo
 from calibration.calibrated_views import CalibratedViews
 from calibration.known_scene import KnownScene
 from calibration.pose import Pose
 from capture.errors import CaptureError, ReconstructionError
-from capture.photos.photo import decode_srgb, read_stack
+from capture.photos.photo import decode_srgb, read_photo, read_stack
 from reconstruct.appearance.brdf import LOBES
 from reconstruct.appearance.lobe_fit import Samples
+from reconstruct.detail import full_photos as detail_photos
 from reconstruct.detail.detail import estimate_illumination, solve_detail
-from reconstruct.detail.file import DETAIL, SURE, load_details, save_details
+from reconstruct.detail.file import DETAIL, SURE, UNIT, load_details, save_details
 from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail, specular_part
 from reconstruct.detail.full_photos import FullPhotos, colours_of, full_photos
 from reconstruct.detail.merge import merged, rotated
@@ -25,8 +27,8 @@ from reconstruct.fields import FurtherView
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.mesh.simplify import simplified
 from reconstruct.mesh.texture import bake, size_for
-from reconstruct.run.detail_stage import write_detail
-from reconstruct.run_folder.folder import RunFolder
+from reconstruct.run.detail_stage import detail_is_asked, write_detail
+from reconstruct.run_folder.folder import KEPT, RunFolder
 from reconstruct.run_folder.once import done_once
 from reconstruct.scene import build_scene
 from reconstruct.shading.noise import Noise
@@ -92,6 +94,16 @@ def test_nothing_is_claimed_along_the_outline_and_beyond_it(ball, detail):
     assert (detail.normals[detail.confidence == 0] == 0).all(-1).mean() > 0.5
 
 
+def test_a_smaller_view_takes_the_mean_of_the_pixels_that_it_covers(detail):
+    small = detail.reduced(4.0)
+    assert small.confidence.shape[0] == round(detail.confidence.shape[0] / 4)
+    assert small.posed_camera.camera.fx == pytest.approx(detail.posed_camera.camera.fx / 4, rel=0.02)
+    assert detail.reduced(1.2) is detail
+    sure = small.confidence > 0.95 * SURE
+    lengths = np.linalg.norm(small.normals[sure].astype(float) / UNIT, axis=-1)
+    assert lengths == pytest.approx(1, abs=1e-3)
+
+
 def test_the_baked_pictures_hold_relief_and_colour(ball, detail):
     full = extract_mesh(ball.fields)
     small, size = simplified(full, 2000), 512
@@ -150,6 +162,40 @@ def test_the_stage_leaves_a_detail_and_is_done_once(ball, tmp_path):
         assert run.costs["detail"].cpu_seconds > 0
         assert len(load_details(run.file(DETAIL), ball.fields)) == 1
         assert "of memory and" in run.file("log.jsonl").read_text()
+
+
+def test_reduced_photos_that_the_run_keeps_are_not_decoded_again(ball, tmp_path, monkeypatch):
+    known = KnownScene(ball.calibration, ball.paths, None, None)
+    source, options = Source(tmp_path, known=known), RunOptions(detail="on", preset="fine")
+    with RunFolder(tmp_path / "run") as run:
+        run.claim({}, {})
+        read_photos(source, options, run.file(KEPT))
+        whole = []
+
+        def counted(path, *how):
+            whole.append(path)
+            return read_photo(path, *how)
+
+        monkeypatch.setattr(capture.photos.photo, "_read_reduced", None)
+        again = read_photos(source, options, run.file(KEPT))
+        monkeypatch.setattr(detail_photos, "read_photo", counted)
+        write_detail(source, options, run, again, CalibratedViews.of(ball.calibration), ball.fields)
+        assert whole == list(ball.paths) and run.file(DETAIL).exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "due"),
+    [
+        (RunOptions(preset="fine"), True),
+        (RunOptions(preset="standard"), False),
+        (RunOptions(preset="fine", detail="off"), False),
+        (RunOptions(preset="draft", detail="on"), True),
+        (RunOptions(preset="fine", input="shadow"), False),
+    ],
+)
+def test_fine_reads_the_detail_and_others_when_asked(ball, tmp_path, options, due):
+    source = Source(tmp_path, known=KnownScene(ball.calibration, ball.paths, None, None))
+    assert detail_is_asked(source, options) == due
 
 
 def test_photos_of_another_size_than_the_calibrated_are_refused(ball):

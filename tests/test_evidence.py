@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from synthetic import BALL, Look, render
 from test_solver import SMALL, Listener
@@ -12,6 +13,7 @@ from reconstruct.fields import load_fields, save_fields
 from reconstruct.mesh.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence, volume_sigma
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
 from reconstruct.run.report_json import guessed, undersides
+from reconstruct.scene import light_share
 from reconstruct.solve.solver import fit
 
 
@@ -67,6 +69,27 @@ def test_uncertain_lights_make_high_vertices_uncertain_and_the_volume_is_within_
     assert told is not None and abs(mesh.volume - true_volume) < 3 * told < 0.5 * true_volume
     del mesh.vertex_attributes["sigma"]
     assert volume_sigma(mesh) is None
+
+
+def test_the_share_of_a_light_is_its_sigma_over_its_distance():
+    scene, _ = render((BALL,), Look(n_lights=4))
+    middle = np.array([10.0, 0.0, 20.0])
+    away = np.linalg.norm(scene.lights[:, :3].double().numpy() - middle, axis=1)
+    sigma = torch.from_numpy(np.outer(0.02 * away, [1, 0, 0])).float()
+    assert light_share(replace(scene, light_sigma=sigma), middle) == pytest.approx(0.02, rel=1e-4)
+    assert light_share(scene, middle) == 0
+
+
+def test_a_volume_is_as_uncertain_as_its_surface_all_in_or_all_out_and_less_where_it_is_guessed():
+    ball, sigma = trimesh.creation.icosphere(4, radius=50.0), 0.5
+    n = len(ball.vertices)
+    between = trimesh.creation.icosphere(4, radius=50.0 + sigma).volume - ball.volume
+    told = []
+    for kind in (SEEN, SHADOW, UNCONSTRAINED):
+        ball.vertex_attributes |= {"evidence": np.full(n, kind, np.uint8), "sigma": np.full(n, sigma, np.float32)}
+        told.append(volume_sigma(ball))
+    assert told[:2] == pytest.approx([between] * 2, rel=0.02)
+    assert 0.2 * between < told[2] < 0.6 * between  # what is guessed is off to both sides
 
 
 def test_evidence_is_stored_with_the_fields_and_the_mesh(solved, tmp_path):

@@ -28,6 +28,7 @@ from calibration.scenes.importers import find_importer, import_folder
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
 from reconstruct.initialization.choose_start import ShadingStart, choose_start
 from reconstruct.labels.observer import Observer
+from reconstruct.labels.outline import bright_object
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.run.presets import preset
 from reconstruct.scene import build_scene
@@ -113,6 +114,15 @@ def test_directions_in_columns_are_read_and_photos_go_by_number_without_a_list(t
     np.testing.assert_allclose(known.calibration.lights[9].direction, towards_lights(truth)[9], atol=1e-6)
 
 
+def test_without_a_mask_the_object_is_what_is_bright_before_a_dark_background():
+    truth = seen_from_above((Sphere((0, 0, 40), 20),))
+    rgb = truth.stack.rgb * np.where(truth.mask, 1, 0.01)[..., None].astype(np.float32)
+    rgb[:, 32, 32] = 0  # dark paint
+    found = bright_object(torch.from_numpy(rgb)).numpy() > 0.5
+    assert (found != truth.mask).mean() < 0.02 and found[32, 32]
+    assert bright_object(torch.from_numpy(truth.stack.rgb)).all()  # a light ground is no dark background
+
+
 # --- RTI -------------------------------------------------------------------------------------------------------------
 
 
@@ -126,6 +136,21 @@ def test_an_rti_folder_gives_directions_by_name_from_its_subfolders(tmp_path, de
     found = np.array([light.direction for light in known.calibration.lights])
     np.testing.assert_allclose(found, towards_lights(truth)[::-1], atol=2e-6)
     assert any("by name" in note for note in known.notes)
+
+
+def test_names_that_fit_no_photo_go_by_order_and_say_so(tmp_path):
+    truth = seen_from_above(side=32, n_lights=6)
+    lines = write_rti(tmp_path, truth)
+    (tmp_path / "assembly-files" / "stone.lp").write_text("\n".join(lines).replace("stone", "rock"))
+    known = loaded(tmp_path)
+    assert any("by order, because the names in the list are not those of the photos" in note for note in known.notes)
+
+
+def test_a_list_that_fits_the_photos_in_part_is_explained(tmp_path):
+    lines = write_rti(tmp_path, seen_from_above(side=32, n_lights=6))
+    (tmp_path / "assembly-files" / "stone.lp").write_text("\n".join(lines).replace("stone_03", "stone_33"))
+    with pytest.raises(CalibrationError, match=r"6 lights and .*jpeg-exports holds 6 photos, of which 5 .* stone_33"):
+        loaded(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -159,6 +159,16 @@ def test_photos_beside_the_folders_are_not_read_and_the_refusal_says_so(tmp_path
         load_session(folder)
 
 
+def test_a_clip_beside_photos_is_not_read_and_that_is_said(tmp_path):
+    folder, _, _ = save_capture(tmp_path, in_folders=True)
+    (folder / "photos" / "clip.mov").write_bytes(b"never opened")
+    assert load_session(folder).notes == ("photos/clip.mov was left out: there are photos beside it",)
+    for name in LIT[3:]:
+        (folder / "photos" / name).unlink()
+    with pytest.raises(CaptureError, match=r"3 photos lit .*clip\.mov is not read beside photos: remove"):
+        load_session(folder)
+
+
 @pytest.mark.parametrize(
     "names",
     [["IMG_1.jxl"], ["a.webp", "b.WebP", "c.bmp"], ["x.jp2"], ["k.nrw", "raw.x3f"], [os.fsdecode(b"caf\xe9.jpg")]],

@@ -4,10 +4,13 @@ import fake_run
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from capture.errors import ReconstructionError
+from capture.photos.photo import encode_srgb
 from reconstruct.stored_run.ply import read_mesh, read_preview
 from viewer.display.layers import (
+    CAMERA_DISTANCE,
     FIRST_FOV,
     MOST_FACES,
     framed_view,
@@ -16,7 +19,7 @@ from viewer.display.layers import (
     page_scale,
 )
 from viewer.display.rate_limit import RateLimit
-from viewer.display.run_follower import RunFollower, status
+from viewer.display.run_follower import RunFollower, loss_curves, size_text, status
 from viewer.page.controls import continued
 from viewer.page.guard import GuardedServer
 from viewer.page.page import Page
@@ -32,6 +35,14 @@ def server():
     guarded.stop()
 
 
+def test_the_status_says_stage_count_and_time_left():
+    now = status(
+        [{"t": 9, "stage": "solve/64", "done": 34, "total": 120, "eta_s": 40.0, "message": "grid of 64"}], True
+    )
+    assert (now.title, now.counts, now.eta_s, now.is_over) == ("Fitting the surface", "34 of 120", 40.0, False)
+    assert now.fraction == pytest.approx(34 / 120)
+
+
 # --- following a run -------------------------------------------------------------------------------------------------
 
 
@@ -40,6 +51,13 @@ def test_a_run_that_let_go_before_the_end_has_stopped():
     assert now.title == "Stopped while carving the first shape"
     assert now.is_over and not now.is_finished
     assert status([{"t": 9, "stage": "done"}], is_running=False).is_finished
+
+
+def test_a_loss_that_a_line_does_not_have_is_a_gap_in_its_curve():
+    lines = [{"t": 1, "numbers": {"loss_a": 3}}, {"t": 2}, {"t": 3, "numbers": {"loss_a": 2, "loss_b": 1, "grid": 64}}]
+    seconds, losses = loss_curves(lines)
+    assert seconds.tolist() == [1, 3] and sorted(losses) == ["loss_a", "loss_b"]
+    assert losses["loss_a"].tolist() == [3, 2] and np.isnan(losses["loss_b"][0])
 
 
 def test_a_curve_with_gaps_is_drawn_through_them_and_never_at_zero():
@@ -69,6 +87,12 @@ def test_the_final_mesh_is_shown_once_it_is_this_runs_whatever_the_dates_of_the_
     assert follower.mesh_name([{"stage": "done"}]) == follower.mesh_name([]) == "mesh.ply"
 
 
+def test_millimetres_are_named_and_scene_units_are_not():
+    times = "\N{MULTIPLICATION SIGN}"
+    assert size_text(np.array([1.0, 2, 3]), "mm") == f"1.0 {times} 2.0 {times} 3.0 mm"
+    assert "mm" not in size_text(np.array([1.0, 2, 3]), "scene")
+
+
 def test_a_log_is_read_on_from_where_it_was_and_anew_if_it_is_another_runs(tmp_path):
     log, follower = tmp_path / "log.jsonl", RunFollower(tmp_path)
     assert follower.log() == []
@@ -84,6 +108,17 @@ def test_a_log_is_read_on_from_where_it_was_and_anew_if_it_is_another_runs(tmp_p
     assert [line["t"] for line in follower.log()] == [9]
     log.unlink()
     assert follower.log() == []
+
+
+def test_a_folder_in_which_nothing_changes_has_no_news(tmp_path):
+    follower = RunFollower(tmp_path)
+    follower.has_news()
+    assert not follower.has_news()
+    for name in ("log.jsonl", "preview.ply"):
+        (tmp_path / name).write_text("{}")
+        assert follower.has_news() and not follower.has_news()
+    (tmp_path / "log.jsonl").unlink()
+    assert follower.has_news()
 
 
 def test_a_growing_mesh_is_sent_again_when_it_is_another_and_its_time_has_come(tmp_path, truth, server):
@@ -114,6 +149,14 @@ def test_a_mesh_of_a_million_triangles_is_simplified_for_the_page_to_what_a_brow
     shown = page_mesh(tmp_path / "mesh.ply")
     assert len(ball.faces) > 1_000_000 > MOST_FACES >= len(shown.faces) > MOST_FACES / 3
     np.testing.assert_allclose(np.ptp(shown.vertices, axis=0), ball.extents, rtol=0.01)
+
+
+def test_the_camera_stands_at_the_page_distance_whatever_the_unit(truth):
+    calibration = truth.calibration
+    scale = page_scale(calibration)
+    eye = calibration.world_from_camera.translation
+    np.testing.assert_allclose(np.linalg.norm(scale.to_page(eye - scale.centre)), CAMERA_DISTANCE)
+    assert scale.centre[2] == pytest.approx(calibration.ground_height)
 
 
 @pytest.mark.parametrize("aspect", [1.6, 1.0, 0.46])
@@ -152,6 +195,16 @@ def test_the_page_follows_a_run_from_nothing_to_the_way_to_its_stage(tmp_path, t
     page.choose_photo(4)
     np.testing.assert_allclose(page._lamp.handle.position, light_position(page._lights[4].light, page._scale))
     assert truth.calibration.lights[4].photo in page.controls._caption.content
+
+
+def test_photos_show_as_they_are_read_before_there_are_lights(tmp_path, truth, server):
+    page = Page(tmp_path, server)
+    (tmp_path / "thumbs").mkdir()
+    for count, name in enumerate(("a.jpg", "b.jpg", "c.jpg"), start=1):
+        Image.fromarray(encode_srgb(truth.stack.rgb[count])).save(tmp_path / "thumbs" / name)
+        page.refresh()
+        assert page.controls.photo_index() == count - 1 and name in page.controls._caption.content
+        assert page.controls._photo.image.shape == truth.stack.rgb[count].shape
 
 
 def test_a_damaged_file_does_not_end_the_page(tmp_path, truth, server):
