@@ -30,7 +30,7 @@ from reconstruct.render.relight import relight
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from tests.glossy import highlight, polished
-from tests.synthetic import BALL, Look, Truth, render
+from tests.synthetic import BALL, Look, Sphere, Truth, render
 
 LOOK = Look(n_lights=24, texture=0.3, noise=0.002)
 ROUGHNESS, F0 = 0.4, 0.08
@@ -136,6 +136,22 @@ def test_a_matt_ball_has_no_lobes_and_its_photos_stay_as_they_are(matt):
     labels = label_object(scene, tensor(truth.points), None, tensor(truth.mask))
     assert without_highlights(scene, tensor(truth.points), labels, dark(scene)) is None
     assert solved(scene, truth).gloss is None
+
+
+def test_gloss_is_that_of_the_part_that_shines():
+    apart = (Sphere((-32.0, 0.0, 28.0), 28.0), Sphere((32.0, 0.0, 28.0), 28.0))
+    scene, truth = render(apart, LOOK)
+    shiny = polished(scene, truth, ROUGHNESS, F0)
+    left = torch.from_numpy(truth.points[..., 0] < 0)
+    assert scene.rgb is not None and shiny.rgb is not None
+    half = replace(shiny, rgb=torch.where(left[..., None], shiny.rgb, scene.rgb), usable=shiny.usable | ~left)
+    nowhere = SdfGrid(torch.full((2, 2, 2), 100.0), torch.full((3,), 500.0), 1.0)
+    normals = tensor(truth.normals * truth.mask[..., None])
+    lit = lit_pixels(half, nowhere, tensor(truth.points), normals)
+    _, gloss = surface_appearance(half, tensor(truth.points), normals, lit, dark(scene))
+    assert gloss is not None
+    scale, on_object = gloss.weights[..., 0], torch.from_numpy(truth.mask)
+    assert scale[on_object & ~left].median() < 0.2 * scale[on_object & left].median()
 
 
 def test_gloss_survives_its_file_and_files_without_it_still_load(fields, tmp_path):

@@ -12,14 +12,15 @@ from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from reconstruct.config import FitConfig, Level
 from reconstruct.fields import Fields, FurtherView, load_fields, save_fields
+from reconstruct.labels.held_out import hold_out
 from reconstruct.labels.observer import Observer
-from reconstruct.labels.supervision import supervise
+from reconstruct.labels.supervision import placed_rays, supervise
 from reconstruct.lies import alignment
 from reconstruct.lies.alignment import SeenSurface, align, seen_surface
 from reconstruct.lies.merged import merged_surface
 from reconstruct.lies.motion_refine import LieRays, compare, refined_motion
 from reconstruct.lies.noise import mean_difference
-from reconstruct.lies.rotations import angle_between, stepped
+from reconstruct.lies.rotations import angle_between, even_rotations, stepped
 from reconstruct.lies.together import SolvedLie, lay_together
 from reconstruct.render.g_buffer import seen_material
 from reconstruct.scene import Scene
@@ -105,6 +106,13 @@ def own_rays(laid):
     return supervise(laid[0], Observer(laid[0]).labels(surface, laid[0]))
 
 
+def test_rotations_leave_no_orientation_far_from_all():
+    found = Rotation.from_matrix(even_rotations(4096))
+    asked = Rotation.from_quat(np.random.default_rng(0).standard_normal((50, 4)))
+    away = [np.degrees((found.inv() * one).magnitude().min()) for one in asked]
+    assert max(away) < 16
+
+
 def test_how_an_object_was_turned_is_found_from_the_halves_that_either_lie_saw(monkeypatch):
     fewer(monkeypatch)
     shapes, motion = lying()
@@ -149,6 +157,16 @@ def test_lies_of_an_object_of_a_few_voxels_are_named_and_the_first_is_kept():
     assert not found.placed and "voxels of the object are seen" in dict(found.refused)["turned_1"]
 
 
+def test_a_placed_scene_meets_the_surface_as_the_scene_does_in_its_own_world(laid, own_rays):
+    scene, motion = laid
+    there = replace(scene, object_from_world=motion)
+    every = np.ones(own_rays.confidence.shape, bool)
+    errors = []
+    for one, surface in ((scene, grid_of(lying()[0])), (there, grid_of(SHAPES))):
+        errors.append(hold_out(placed_rays(own_rays, one), every)[1].errors(surface, placed(one)))
+    assert errors[0].mean() < 0.1 and np.abs(errors[0] - errors[1]).mean() < 0.02
+
+
 def test_lights_of_another_lie_move_in_its_own_world(laid):
     scene, motion = laid
     there = replace(scene, object_from_world=motion)
@@ -185,6 +203,17 @@ def test_lights_that_are_all_too_high_pull_a_motion_less_where_they_may_be(laid,
     (turn, shift, still), (less_turn, less_shift, change) = found
     assert less_turn < 0.7 * turn and less_shift < 0.7 * shift
     assert not still.any() and float(change[:, 2].mean()) < 0
+
+
+def test_a_refined_motion_is_kept_where_a_guessed_part_of_the_surface_hides_what_it_gains(laid, own_rays):
+    scene, motion = laid
+    rays, about = LieRays((scene,), (own_rays,)), np.array([5.0, 0.0, 30.0])
+    start = stepped(motion, np.array([-0.01, 0.01, -0.01, -0.4, 0.3, -0.3]), about)
+    guessed = grid_of((*SHAPES, Sphere((-22.0, 16.0, 20.0), 9.0, COLOUR)))
+    found = compare(guessed, (start, rays), (motion, rays))
+    assert found.before < found.after and found.is_kept
+    worse = stepped(motion, np.array([0.05, -0.04, 0.05, 1.5, -1.2, 1.0]), about)
+    assert not compare(grid_of(SHAPES), (motion, rays), (worse, rays)).is_kept
 
 
 @pytest.mark.parametrize("groups", [np.zeros(40, int), np.arange(40) // 10])

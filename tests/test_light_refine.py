@@ -17,7 +17,7 @@ from reconstruct.labels.supervision import supervise
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.solve.level import LevelFit
-from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift
+from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift, unseen_motion
 from reconstruct.solve.ray_operators import cross_entropy
 from reconstruct.solve.solver import fit
 from reconstruct.solve.trials import judge, try_lights
@@ -85,6 +85,21 @@ def test_the_light_gradient_is_the_derivative_of_the_loss(light):
             assert abs(left[:3] @ axis - slope) < 0.02 * left[3], (label, left[:3] @ axis, slope)
 
 
+def test_a_homology_about_the_eye_keeps_what_is_in_line():
+    scene, _ = render((BALL,), Look(n_lights=6))
+    scene = replace(scene, light_sigma=torch.ones(6, 3))
+    eye, lights = scene.eye.double().numpy(), scene.lights.double().numpy()[:, :3]
+    small = 1e-9  # moves the lights by some 1e-4 mm
+    moved = lights + small * unseen_motion(scene)
+    for light, light_moved in zip(lights, moved, strict=True):
+        foot = np.array([30.0, -20.0, 0.0])
+        blocker = foot + 0.2 * (light - foot)
+        blocker_moved = blocker + small * blocker[2] * (eye - blocker)
+        away = np.cross(blocker_moved - foot, light_moved - foot)
+        alone = np.cross(blocker - foot, light_moved - foot)
+        assert np.linalg.norm(away) < 1e-3 * np.linalg.norm(alone)  # of second order
+
+
 def test_a_known_light_never_moves_and_an_uncertain_one_only_against_its_gradient():
     scene, _ = render((BALL,), Look(n_lights=16))
     sigma = torch.full((16, 3), 5.0)
@@ -102,6 +117,14 @@ def test_a_known_light_never_moves_and_an_uncertain_one_only_against_its_gradien
     assert shift[2, 0] < 0 and shift[3, 0] < 0 and shift[3, 2] < 0
     assert np.abs(shift.mean(0)).max() < 0.1 * np.abs(shift).max()  # all together they stay
     assert np.linalg.norm(lights.shift.shift, axis=1).max() <= 3.0 + 1e-9
+
+
+def test_a_direction_stays_a_unit_vector():
+    scene, _ = render((BALL,), Look(n_lights=4, kind="directional"))
+    scene = replace(scene, light_sigma=torch.full((4, 3), 0.02))
+    turned = lit_from(scene, LightShift(np.ones((4, 3)), np.zeros((4, 3))))
+    torch.testing.assert_close(turned.lights.norm(dim=1), torch.ones(4))
+    assert (turned.lights != scene.lights).any(1).all()
 
 
 def heap(kind: str = "point"):
