@@ -8,6 +8,7 @@ import numpy as np
 from synthetic import Truth
 
 from calibration.camera import Camera
+from calibration.light import Light
 from calibration.pose import Pose
 from capture.photos.photo import encode_srgb
 
@@ -102,3 +103,41 @@ def write_shadowneus_real(folder: Path, truth: Truth, unit: float = 0.01, floor:
         write_photo(folder / "image" / f"{i:03d}.png", rgb)
     write_grey(folder / "mask.png", cv2.dilate(truth.mask.astype(np.uint8), np.ones((9, 9))))
     np.savez(folder / "params.npz", **arrays)
+
+
+def sun_matrix(light: Light) -> list[list[float]]:
+    """World from light in Blender axes: shines along -z."""
+    place = np.array(light.position) if light.kind == "point" else 500 * np.array(light.direction)
+    back = place / np.linalg.norm(place)
+    side = np.cross([0.3, 0.4, 0.86], back)
+    side /= np.linalg.norm(side)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([side, np.cross(back, side), back, place], 1)
+    return matrix.tolist()
+
+
+def write_shadowneus(folder: Path, truth: Truth, light_type: str | None = "point", pictures: str = "colour") -> Path:
+    """Rendered pictures with the scene's description; pictures: "colour", "shadow", or "both" and a silhouette."""
+    camera, pose = truth.calibration.camera, truth.calibration.world_from_camera
+    matrix, frames = np.eye(4), []
+    matrix[:3, :3], matrix[:3, 3] = pose.rotation @ OPENGL, pose.translation
+    for i, (light, rgb) in enumerate(zip(truth.calibration.lights, truth.stack.rgb, strict=True)):
+        name = f"train/r_{i:03d}"
+        if pictures == "shadow":
+            write_grey(folder / f"{name}.png", truth.visibility[i])
+        else:
+            write_photo(folder / f"{name}.png", rgb)
+        if pictures == "both":
+            write_grey(folder / f"{name}_white_.png", truth.visibility[i])
+        matrices = {"transform_matrix": matrix.tolist(), "transform_matrix_sun": sun_matrix(light)}
+        frames.append({"file_path": name, **matrices})
+    if pictures == "both":
+        (folder / "test_one").mkdir()
+        silhouette = np.zeros((camera.height, camera.width, 4), np.uint8)
+        silhouette[..., 3] = 255 * truth.mask
+        cv2.imwrite(str(folder / "test_one" / "r_000.png"), silhouette)
+    scene = {"camera_angle_x": float(2 * np.arctan(camera.width / 2 / camera.fx)), "frames": frames}
+    scene |= {} if light_type is None else {"light_type": light_type}
+    (folder / "transforms_train.json").write_text(json.dumps(scene))
+    (folder / "transforms_floor.json").write_text(json.dumps({"frames": [{"transform_ground": np.eye(4).tolist()}]}))
+    return folder

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import trimesh
 from brief_drafts import ENVIRONMENT, brief_command
+from dataset_folders import write_shadowneus
 from PIL import Image
 from synthetic import HEAP, Look, Truth, render
 from waiting import wait_until
 
 import shadowgraph
-from capture.photos.photo import write_picture
 from reconstruct.run_folder.folder import read_log
 
 RESULTS = [
@@ -28,28 +28,6 @@ RESULTS = [
     "report.json",
     "report.html",
 ]
-OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def write_scene(folder: Path, truth: Truth) -> Path:
-    """The truth's photos in the ShadowNeuS layout, as a renderer would export them."""
-    (folder / "train").mkdir(parents=True)
-    camera, pose = truth.calibration.camera, truth.calibration.world_from_camera
-    frames = []
-    for i, (light, rgb) in enumerate(zip(truth.calibration.lights, truth.stack.rgb, strict=True)):
-        write_picture(folder / "train" / f"r_{i:03d}.png", rgb)
-        sun = np.eye(4)
-        sun[:3, 3] = light.position
-        matrix = (pose.matrix() @ OPENGL_FROM_OPENCV).tolist()
-        frames.append(
-            {"file_path": f"train/r_{i:03d}", "transform_matrix": matrix, "transform_matrix_sun": sun.tolist()}
-        )
-    angle = 2 * np.arctan(camera.width / 2 / camera.fx)
-    scene = {"camera_angle_x": float(angle), "light_type": "point", "frames": frames}
-    (folder / "transforms_train.json").write_text(json.dumps(scene))
-    floor = {"frames": [{"transform_ground": np.eye(4).tolist()}]}
-    (folder / "transforms_floor.json").write_text(json.dumps(floor))
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +37,7 @@ def truth() -> Truth:
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory, truth) -> Path:
-    return write_scene(tmp_path_factory.mktemp("scene") / "heap", truth)
+    return write_shadowneus(tmp_path_factory.mktemp("scene") / "heap", truth)
 
 
 @pytest.mark.usefixtures("brief_draft")

@@ -14,10 +14,10 @@ import psutil
 import pytest
 import torch
 from brief_drafts import ENVIRONMENT, brief_command
+from dataset_folders import write_shadowneus
 from safetensors import safe_open
 from synthetic import BALL, HEAP, Look, render
 from test_crash import TINY, Stop
-from test_end_to_end import write_scene
 from waiting import PATIENCE_S, wait_until
 
 import shadowgraph
@@ -124,7 +124,7 @@ def test_a_gradient_that_is_no_number_is_found_even_if_the_errors_are(scene, mon
 @pytest.mark.slow
 def test_sigterm_saves_the_last_rest_and_leaves_within_five_seconds(tmp_path):
     truth = render(HEAP, Look(width=80, height=60, n_lights=8, texture=0.1))[1]
-    scene, out = write_scene(tmp_path / "heap", truth), tmp_path / "out"
+    scene, out = write_shadowneus(tmp_path / "heap", truth), tmp_path / "out"
     words = ["run", str(scene), "--out", str(out), "--preset", "draft", "--viewer", "off", "--seed", "5"]
     process = subprocess.Popen(
         brief_command(*words),

@@ -2,9 +2,9 @@
 
 import json
 
-import cv2
 import numpy as np
 import pytest
+from dataset_folders import write_shadowneus
 from synthetic import BALL, Look, render
 
 from calibration.scenes.shadowneus import ShadowNeus, load_known_scene
@@ -12,54 +12,12 @@ from capture.errors import CalibrationError, CaptureError, UserError
 from reconstruct.source.options import RunOptions
 from reconstruct.source.source import open_source
 
-BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
-
-def sun_matrix(light) -> list:
-    """World from light in Blender axes: shines along -z."""
-    place = light.position if light.kind == "point" else 500 * light.direction
-    back = place / np.linalg.norm(place)
-    side = np.cross([0.3, 0.4, 0.86], back)
-    side /= np.linalg.norm(side)
-    matrix = np.eye(4)
-    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2], matrix[:3, 3] = side, np.cross(back, side), back, place
-    return matrix.tolist()
-
-
-def write_scene(folder, look=None, light_type=None, shadow_only=False, shapes=(BALL,)):
+def write_scene(folder, look=None, light_type=None, pictures="both", shapes=(BALL,)):
     """A synthetic scene on disk; returns its truth."""
     _, truth = render(shapes, look or Look(width=60, height=44, n_lights=6))
-    camera, pose = truth.calibration.camera, truth.calibration.world_from_camera
-    (folder / "train").mkdir(parents=True)
-    (folder / "test_one").mkdir()
-    frames = []
-    for i, light in enumerate(truth.calibration.lights):
-        grey = (255 * truth.visibility[i]).astype(np.uint8)
-        colour = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR) if shadow_only else encoded(truth.stack.rgb[i])[..., ::-1]
-        cv2.imwrite(str(folder / "train" / f"r_{i:03d}.png"), colour)
-        cv2.imwrite(str(folder / "train" / f"r_{i:03d}_white_.png"), grey)
-        frames.append(
-            {
-                "file_path": f"train/r_{i:03d}",
-                "transform_matrix": (pose.matrix() @ BLENDER_FROM_OPENCV).tolist(),
-                "transform_matrix_sun": sun_matrix(light),
-            }
-        )
-    alpha = np.zeros((camera.height, camera.width, 4), np.uint8)
-    alpha[..., 3] = 255 * truth.mask
-    cv2.imwrite(str(folder / "test_one" / "r_000.png"), alpha)
-    angle = 2 * np.arctan(camera.width / 2 / camera.fx)
-    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
-    (folder / "transforms_floor.json").write_text(json.dumps({"frames": [{"transform_ground": np.eye(4).tolist()}]}))
-    if light_type:
-        (folder / "scene.json").write_text(json.dumps({"light_type": light_type}))
+    write_shadowneus(folder, truth, light_type, pictures)
     return truth
-
-
-def encoded(linear: np.ndarray) -> np.ndarray:
-    return (255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055) + 0.5).astype(
-        np.uint8
-    )
 
 
 def edit(path, change):
@@ -88,7 +46,7 @@ def test_the_shading_tells_point_lights_from_directional_ones(tmp_path, kind):
 
 
 def test_both_kinds_of_pictures_are_refused_by_the_name_of_the_one_that_is_missing(tmp_path):
-    write_scene(tmp_path, light_type="point", shadow_only=True)
+    write_scene(tmp_path, light_type="point", pictures="shadow")
     with pytest.raises(CaptureError, match="no colour photos, which --input both needs"):
         open_source(tmp_path, RunOptions(input="both"))
 

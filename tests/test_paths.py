@@ -13,8 +13,8 @@ import pytest
 import trimesh
 from brief_drafts import brief_drafts
 from confined import limited
+from dataset_folders import write_shadowneus
 from synthetic import BALL, Look, render
-from test_end_to_end import write_scene
 
 import shadowgraph
 from reconstruct.run.bundle import without_paths, write_bundle
@@ -26,7 +26,7 @@ COMMA_LOCALES = ("de_DE.UTF-8", "de_DE.utf8", "fr_FR.UTF-8", "fr_FR.utf8", "nl_N
 def run(tmp_path_factory) -> Iterator[tuple[Path, Path, dict[str, tuple[int, int]]]]:
     """A whole run: spaces, quotes, umlauts, an emoji, a link, more than 260 letters, read-only input."""
     top = tmp_path_factory.mktemp("Jörg's $HOME; rm -rf ~ 📷")
-    capture = write_scene(top / "真珠 & co" / "ball", render((BALL,), Look(width=64, height=48, n_lights=8))[1])
+    capture = write_shadowneus(top / "真珠 & co" / "ball", render((BALL,), Look(width=64, height=48, n_lights=8))[1])
     for path in [*capture.rglob("*"), capture]:
         path.chmod(stat.S_IRUSR | (stat.S_IXUSR if path.is_dir() else 0))
     before = state_of(capture)

@@ -3,12 +3,12 @@
 import json
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 import torch
+from dataset_folders import write_photo
 from synthetic import BALL, Look, render
-from test_known import encoded, write_scene
+from test_known import write_scene
 from test_solver import SMALL, Listener, depth_error
 
 from calibration.scenes.shadowneus import load_known_scene
@@ -78,14 +78,13 @@ def write_two_lights(folder):
     frames = content["frames"]
     for i in range(0, len(frames), 2):
         frames[i]["transform_matrix_sun"] = [frames[i + k]["transform_matrix_sun"] for k in range(2)]
-        both = encoded((truth.stack.rgb[i] + truth.stack.rgb[i + 1]) / 2)
-        cv2.imwrite(str(folder / "train" / f"r_{i:03d}.png"), both[..., ::-1])
+        write_photo(folder / "train" / f"r_{i:03d}.png", (truth.stack.rgb[i] + truth.stack.rgb[i + 1]) / 2)
     path.write_text(json.dumps(content | {"frames": frames[::2]}))
     return truth
 
 
 def test_shadow_pictures_alone_cannot_say_which_of_two_lights_is_hidden(tmp_path):
-    write_scene(tmp_path, light_type="point", shadow_only=True)
+    write_scene(tmp_path, light_type="point", pictures="shadow")
     path = tmp_path / "transforms_train.json"
     content = json.loads(path.read_text())
     content["frames"][1]["transform_matrix_sun"] = [content["frames"][k]["transform_matrix_sun"] for k in (1, 2)]

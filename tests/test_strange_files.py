@@ -18,6 +18,7 @@ from dataset_folders import (
     write_grey,
     write_rti,
     write_s3nerf,
+    write_shadowneus,
     write_shadowneus_real,
 )
 from hypothesis import HealthCheck, given, settings
@@ -51,26 +52,13 @@ def write_deepshadow(folder: Path, truth) -> None:
         write_grey(folder / "0" / f"cup_0_{i}_shadow1.png", grey)
 
 
-def write_shadowneus(folder: Path, truth) -> None:
-    frames = []
-    for i, light in enumerate(truth.calibration.lights):
-        write_grey(folder / "train" / f"r_{i}.png", truth.visibility[i])
-        sun = np.eye(4)
-        sun[:3, 3] = light.position
-        pose = truth.calibration.world_from_camera.matrix() @ np.diag([1.0, -1, -1, 1])
-        matrices = {"transform_matrix": pose.tolist(), "transform_matrix_sun": sun.tolist()}
-        frames.append({"file_path": f"train/r_{i}", **matrices})
-    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 0.5, "frames": frames}))
-    (folder / "transforms_floor.json").write_text(json.dumps({"frames": [{"transform_ground": np.eye(4).tolist()}]}))
-
-
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory) -> dict[str, Path]:
     """A tiny scene of every layout."""
     root = tmp_path_factory.mktemp("scenes")
     near = render((BALL,), SMALL)[1]
     far = render((BALL,), Look(width=16, height=16, n_lights=4, kind="directional"), from_above(16))[1]
-    write_shadowneus(root / "shadowneus", near)
+    write_shadowneus(root / "shadowneus", near, None, "shadow")
     write_deepshadow(root / "deepshadow", near)
     write_s3nerf(root / "s3nerf", near)
     write_shadowneus_real(root / "real", near)

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from dataset_folders import write_shadowneus
 from synthetic import Look, Sphere, render
-from test_end_to_end import write_scene
 
 import shadowgraph
 from capture.errors import ReconstructionError
@@ -195,7 +195,7 @@ def test_a_training_without_finite_gradients_says_so(shadows, frame):
 
 @pytest.mark.slow
 def test_a_trained_field_becomes_a_mesh_by_the_command(tmp_path, monkeypatch, capsys):
-    scene = write_scene(tmp_path / "ball", render((BALL,), Look(width=64, height=48, n_lights=10))[1])
+    scene = write_shadowneus(tmp_path / "ball", render((BALL,), Look(width=64, height=48, n_lights=10))[1])
     out = tmp_path / "out"
     monkeypatch.setattr(solve_stage, "training", lambda *_: (64, replace(TINY, mesh_nodes=32)))
     arguments = ["run", str(scene), "--out", str(out), "--viewer", "off", "--preset", "paper"]

@@ -27,9 +27,9 @@ from sheet import ROOT, Sheet, parser_of
 
 # isort: split
 from confined import limited  # pyright: ignore[reportMissingImports]
+from dataset_folders import write_shadowneus  # pyright: ignore[reportMissingImports]
 from fuzz_images import DAMAGES, fuzzed  # pyright: ignore[reportMissingImports]
 from synthetic import BALL, Look, render  # pyright: ignore[reportMissingImports]
-from test_end_to_end import write_scene  # pyright: ignore[reportMissingImports]
 
 from calibration.calibration import load_calibration, save_calibration
 from calibration.lights.files import read_lights
@@ -72,7 +72,7 @@ def make_scene(folder: Path) -> list[Path]:
     from fake_run import fields_of, make_truth  # pyright: ignore[reportMissingImports]
 
     truth = render((BALL,), Look(width=24, height=18, n_lights=4))[1]
-    write_scene(folder, truth)
+    write_shadowneus(folder, truth)
     own = folder.with_name("own")
     save_calibration(truth.calibration, own / "calibration.json")
     save_fields(fields_of(make_truth(width=32, n_lights=4)), own / "fields.safetensors")

@@ -30,8 +30,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from sheet import ROOT, Sheet, parser_of
 
 # isort: split
+from dataset_folders import write_shadowneus  # pyright: ignore[reportMissingImports]
 from synthetic import HEAP, Look, render  # pyright: ignore[reportMissingImports]
-from test_end_to_end import write_scene  # pyright: ignore[reportMissingImports]
 
 from reconstruct.run.machine import kernels_are_compiled
 
@@ -137,7 +137,7 @@ def killed_until_done(words: list[str], out: Path, whole: Whole, draw: random.Ra
 
 def small_scene(folder: Path) -> Path:
     """A ball, another and a box on a table under 10 lights, in the ShadowNeuS layout."""
-    return write_scene(folder, render(HEAP, Look(width=96, height=72, n_lights=10, texture=0.1))[1])
+    return write_shadowneus(folder, render(HEAP, Look(width=96, height=72, n_lights=10, texture=0.1))[1])
 
 
 def main() -> int:
