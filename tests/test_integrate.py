@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_erosion
 
 from reconstruct.hull.follow_normals import follow_normals
 from reconstruct.hull.normal_integration import integrate_behind, integrate_normals, integrate_within
@@ -15,6 +16,9 @@ from reconstruct.sdf.level_set import resampled
 from tests.synthetic import Box, Look, render
 
 BLOCK = Box((-45.0, -30.0, 0.0), (45.0, 30.0, 40.0))
+
+
+POST = Box((-12.0, -60.0, 0.0), (12.0, -45.0, 60.0))
 SURE = 1.0
 PIXEL = 2.1  # mm at the object
 
@@ -63,6 +67,15 @@ def test_the_true_surface_stays(block):
     assert np.nanmax(np.abs(found - length)) < 0.05 * PIXEL
 
 
+def test_a_thing_before_another_is_not_drawn_to_it():
+    scene, truth = render((BLOCK, POST), Look(n_lights=2))
+    along, length, normals = rays_and_lengths(scene, truth)
+    bulged, top = domed(length, truth, 6.0)
+    found = integrate_normals(along, bulged, normals_of(along, bulged), normals, np.full(top.shape, SURE))
+    inner = binary_erosion(truth.mask, iterations=2)
+    assert np.abs(found - length)[inner].max() < 1.2 * PIXEL
+
+
 @pytest.mark.parametrize("wrong", [0.0, 0.02])
 def test_a_top_under_the_dome_of_a_hull_is_found_at_the_rim(block, wrong):
     along, length, normals = rays_and_lengths(*block)
@@ -91,6 +104,16 @@ def test_a_hollow_lies_below_the_lid_that_a_hull_puts_on_it(block):
     beside = block[1].mask & ~inside
     assert within[back].mean() < 0.7 * tied[back].mean()
     assert within[beside].mean() < 0.3 * PIXEL < 3 * PIXEL < tied[beside].mean()
+
+
+def test_what_is_in_front_of_a_hull_weighs_more(block):
+    along, length, normals = rays_and_lengths(*block)
+    uneven = length + np.where(np.arange(length.shape[1]) % 2 > 0, 2.0, -2.0)
+    trust = np.full(length.shape, SURE)
+    even, bound = (
+        integrate_normals(along, uneven, normals_of(along, uneven), normals, trust, w) for w in (False, True)
+    )
+    assert np.nanmean(bound - even) > 0.3
 
 
 def test_a_grid_follows_the_normals_of_its_labels(block):

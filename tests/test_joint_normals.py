@@ -64,6 +64,16 @@ def test_neighbours_tell_the_normals_that_two_lit_photos_leave_open(ball):
     assert float((weight.sum(1) - lit).abs().median()) < 0.5
 
 
+def test_the_surface_so_far_decides_what_no_photo_lights(ball):
+    picture, pixels, normals, _ = ball
+    dark = normals[:, 1] > 0.3
+    unseen = replace(pixels, usable=pixels.usable & ~dark[:, None])
+    alone, _ = fit_normals(unseen)
+    start = torch.where(dark[:, None], torch.tensor([0.0, 0.0, -0.5]), alone)
+    guided, _ = fit_together(picture, unseen, normals, start)
+    assert angles(guided, normals)[dark.numpy()].mean() < 5
+
+
 def of_few_photos(ball, value, colour=None):
     """Normals and albedos of all pixels together from such values, begun from each pixel's own."""
     picture, pixels, normals, _ = ball

@@ -10,6 +10,7 @@ from synthetic import BALL, Look, render
 from calibration.scenes.shadowneus import ShadowNeus, load_known_scene
 from capture.errors import CalibrationError, CaptureError, UserError
 from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import read_photos
 from reconstruct.source.source import open_source
 
 
@@ -43,6 +44,18 @@ def test_camera_ground_and_point_lights_come_back_as_written(tmp_path):
 def test_the_shading_tells_point_lights_from_directional_ones(tmp_path, kind):
     write_scene(tmp_path, Look(width=60, height=44, n_lights=6, kind=kind))
     assert {light.kind for light in load_known_scene(tmp_path).calibration.lights} == {kind}
+
+
+@pytest.mark.parametrize(
+    ("wanted", "colour", "shadow"), [("auto", 1, 0), ("rgb", 1, 0), ("shadow", 0, 1), ("both", 1, 1)]
+)
+def test_the_pictures_that_were_asked_for_are_read(tmp_path, wanted, colour, shadow):
+    truth = write_scene(tmp_path, light_type="point")
+    options = RunOptions(input=wanted)
+    pictures = read_photos(open_source(tmp_path, options), options)[0]
+    assert (pictures.stack is not None, pictures.shadow is not None) == (colour, shadow)
+    if pictures.shadow is not None:
+        assert np.array_equal(pictures.shadow, truth.visibility)
 
 
 def test_both_kinds_of_pictures_are_refused_by_the_name_of_the_one_that_is_missing(tmp_path):

@@ -59,6 +59,12 @@ def test_a_cast_shadow_behind_known_matter_turns_no_normal():
     assert angles(kept, true)[0] < 16 < 24 < angles(turned, true)[0]
 
 
+def test_few_lights_on_one_side_leave_the_normal_open():
+    towards = lights(4, 40, 50)
+    _, confidence = read(torch.tensor([[0.0, 0, 1]]), towards, torch.ones(4, 1), torch.ones(4, 1))
+    assert confidence[0] < 0.1
+
+
 def shadow_start(shape, name: str = HULL) -> tuple[HullStart, tuple]:
     """The start of a solve from exact shadow pictures with a mask, and its scene."""
     scene, _ = render((shape,), Look(n_lights=24, with_shadow=True, with_mask=True))

@@ -7,7 +7,7 @@ import pytest
 
 from calibration.flashlight.fit import collect, first_guess, fit_flashlights
 from calibration.flashlight.light_estimate import free_tangent, locate_lights
-from calibration.flashlight.tone_curve import OTHER_CURVES, compare_curves
+from calibration.flashlight.tone_curve import OTHER_CURVES, ToneTest, compare_curves
 from capture.checks.check_stack import white_balance_finding
 from capture.errors import CaptureError
 from capture.photos.photo import decode_srgb
@@ -58,6 +58,14 @@ def test_the_white_balance_of_single_photos_is_found_and_divided_out(stack):
     assert "divided out" in white_balance_finding(stack.paths[3], 1.2).text
 
 
+def test_colours_that_cancel_over_the_picture_are_no_white_balance_and_change_no_brightness(stack):
+    rgb, third = stack.rgb.copy(), np.arange(stack.rgb.shape[2]) % 3
+    rgb[4] *= np.exp(0.1 * (3 * np.eye(3)[third] - 1)).astype(np.float32)  # columns in red, green and blue light
+    balance = white_balance(replace(stack, rgb=rgb))
+    assert np.log(balance).sum(1) == pytest.approx(np.zeros(N), abs=1e-6)
+    assert balance[4] == pytest.approx(np.ones(3), abs=0.01)
+
+
 # --- the tone curve --------------------------------------------------------------------------------------------------
 
 
@@ -85,6 +93,17 @@ def test_files_on_another_curve_than_srgb_raise_doubt(monkeypatch):
 def test_files_on_the_curve_of_bt709_are_decoded_to_the_light_that_made_them():
     linear = np.array([0.002, 0.01, 0.017, 0.02, 0.1, 0.5, 0.95], np.float32)
     np.testing.assert_allclose(OTHER_CURVES["BT.709"](on_bt709(linear)), linear, rtol=2e-3)
+
+
+def test_nothing_is_said_against_srgb_unless_another_curve_is_clearly_better():
+    shown = {"sRGB": 0.0020, "BT.709": 0.0018, "a steeper curve": 0.0021, "a flatter curve": 0.0022}
+    found = ToneTest(shown, np.array([10.0, 20.0]), np.array([3.0, 4.0]))
+    assert found.best() == "sRGB" and found.sentence() == "" and found.document()["residuals"] == shown
+    np.testing.assert_allclose(found.error(), [5.0, 10.0])  # half of the way between a hint and a clear answer
+    moved = found.moved, found.moved_flatter
+    assert not ToneTest(shown | {"BT.709": 0.00191}, *moved).error().any()
+    flatter = ToneTest(shown | {"BT.709": 0.0022, "a flatter curve": 0.0021}, *moved)
+    np.testing.assert_allclose(flatter.error(), [1.5, 2.0])  # true sRGB fits worse by more when it is decoded flatter
 
 
 def test_of_linear_photos_no_curve_is_doubted_and_no_light_less_certain():

@@ -18,7 +18,7 @@ from capture.photos.finding import Finding
 from reconstruct.check import verdict as readiness
 from reconstruct.check.light_coverage import from_the_camera, shadow_cover, side_in_words
 from reconstruct.check.readiness import judge, refuse_hopeless
-from reconstruct.check.verdict import CaptureCheck
+from reconstruct.check.verdict import CaptureCheck, tone_doubts
 from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import Photos
 from reconstruct.source.source import Source
@@ -125,6 +125,13 @@ def test_the_larger_group_has_the_right_exposure_wherever_it_stands(truth):
         assert all(finding.value == pytest.approx(0.5, rel=0.06) for finding in found)
 
 
+def test_with_three_exposures_the_largest_group_is_right(truth):
+    powers = [2.0] * 8 + [1.0] * 10 + [0.5] * 8
+    calibration = with_powers(truth.calibration, powers)
+    found = readiness.with_power_changes((), calibration, truth.stack)
+    assert [finding.photo for finding in found] == [*truth.stack.paths[:8], *truth.stack.paths[18:]]
+
+
 def test_a_tripod_that_moved_is_a_reason_and_the_advice_is_to_photograph_the_board_again(truth, cover):
     names = [light.photo for light in truth.calibration.lights]
     left_out = [Finding(Path(name), BOARD_OFF, "", 9.4, 0.6, True) for name in names[7:]]
@@ -163,6 +170,12 @@ def test_doubts_and_dropped_photos_are_reasons(truth, cover):
     found = judge(replace(truth.calibration, lights=lights), findings, cover, ("the tone curve is doubtful",))
     assert "17 of 26 photos can be used (9 blurred)" in found.reasons
     assert "the tone curve is doubtful" in found.reasons
+
+
+def test_a_doubtful_tone_curve_is_said(truth):
+    doubted = replace(truth.calibration, residuals={"tone": {"doubt": "tone curve: BT.709 fits better"}})
+    assert tone_doubts(doubted) == ("tone curve: BT.709 fits better",)
+    assert tone_doubts(truth.calibration) == ()
 
 
 def test_the_page_and_the_terminal_say_it_all(truth, cover, tmp_path):

@@ -119,6 +119,7 @@ def test_the_heights_of_a_sheet_are_found_and_stand_on_the_table():
 
 def test_waves_that_no_photo_tells_of_are_as_large_as_those_of_sheets_usually_are():
     sheet = sheet_of([corners_of(BOARDS[0], CAMERA, look_at((75.0, -105.0, 500.0)))])
+    assert sheet is not None
     k = sheet.basis.shape[1]
     unknown = weigh_waves(sheet, np.zeros(k), np.zeros((k, k)), 48.0, 48.0, 0.05)
     assert unknown.size == 0 and unknown.possible == pytest.approx(USUAL_SIZE, rel=0.05)
