@@ -92,10 +92,9 @@ COPIES = {
 
 
 @pytest.mark.parametrize("how", COPIES)
-@pytest.mark.parametrize("is_sorted", [True, False])
-def test_a_copy_is_left_out_and_its_original_stays(tmp_path, how, is_sorted):
-    folder = save_capture(tmp_path, is_sorted)
-    COPIES[how](folder / ("photos" if is_sorted else "") / LIT[3])
+def test_a_copy_is_left_out_and_its_original_stays(tmp_path, how):
+    folder = save_capture(tmp_path)
+    COPIES[how](folder / "photos" / LIT[3])
     session = load_session(folder)
     assert [path.name for path in session.lit] == LIT and not session.light
     (found,) = session.left_out
@@ -154,9 +153,9 @@ def test_where_too_few_are_left_one_error_lists_all_faults(tmp_path, is_sorted):
 CLOSE = np.array([[-60, -50], [340, -30], [330, 290], [-40, 270]])
 
 
-@pytest.mark.parametrize("second", [5, 13, 40])  # before, between and after the lit photos
+@pytest.mark.parametrize("second", [5, 13])  # before and between the lit photos
 @pytest.mark.parametrize("model", ["Tripod", "Another"])
-@pytest.mark.parametrize("light", [1.0, 1.6, 3.0])  # angle of the flashlight: a close-up by it is dim at one side
+@pytest.mark.parametrize("light", [1.0, 3.0])  # angle of the flashlight: a close-up by it is dim at one side
 def test_a_photo_in_which_a_board_is_found_is_one_of_the_board(tmp_path, second, model, light):
     folder, rng = save_capture(tmp_path, is_sorted=False), np.random.default_rng(2)
     close = lit_table.with_board(lit_table.table(rng), CLOSE) * lit_table.flashlight(light, in_shadow=1.0)
