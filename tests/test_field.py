@@ -8,7 +8,7 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.field import SdfField
 from reconstruct.shadowneus.grid_field import GridField
 from reconstruct.shadowneus.hash_field import HashField, HashLevels
-from reconstruct.shadowneus.mlp_field import Materials, Network, NeuralField, specular
+from reconstruct.shadowneus.mlp_field import Materials, Network, NeuralField, Sharpness, specular
 
 REACH, RADIUS, GROUND = 2.0, 1.0, -0.7
 SMALL = Network(width=32, depth=3, skip=2, frequencies=3, features=8, material_width=16, material_depth=2)
@@ -67,6 +67,10 @@ def test_the_paper_s_network_starts_as_a_ball_and_has_its_sizes():
     albedo, coefficients = materials(points[:5], points[:5], field.features(points[:5]))
     assert albedo.shape == (5, 3) and coefficients.shape == (5, LOBES, 3)
     assert (albedo >= 0).all() and (coefficients >= 0).all()
+
+
+def test_sharpness_starts_at_twenty():
+    assert abs(float(Sharpness()().detach()) - 20.09) < 0.01  # e^3
 
 
 @pytest.mark.parametrize("name", TRAINABLE)

@@ -50,6 +50,16 @@ def test_ground_shadows_of_both_lights_and_the_object_are_found():
     assert weight.sum() > 0.85 * (~truth.mask).sum() * len(weight)
 
 
+def test_two_lights_that_send_the_same_are_not_told_apart_where_one_of_them_is_hidden():
+    scene, truth = render((BALL,), replace(LOOK, kind="directional", noise=0.0))
+    assert scene.rgb is not None
+    cosine = scene.lights[:, 2]
+    twins = replace(scene, power=scene.power / cosine[:, None], rgb=scene.rgb / cosine[:, None, None, None])
+    single = split_on_ground(added(twins))
+    one = (truth.visibility[0::2] != truth.visibility[1::2]).repeat(2, 0) & ~truth.mask
+    assert single.usable.numpy()[one].mean() < 0.1 < 0.95 < single.usable.numpy()[~one & ~truth.mask].mean()
+
+
 @pytest.mark.slow  # 11 s; the labels that such a solve is given are tested above
 def test_a_solve_of_twelve_photos_under_two_lights_is_about_as_good_as_of_twenty_four_under_one():
     scene, truth = render((BALL,), LOOK)

@@ -1,5 +1,7 @@
 """Truth: the balls' own normals and colours, against what a shader would make of the baked pictures."""
 
+from dataclasses import replace
+
 import fake_run
 import numpy as np
 import pytest
@@ -44,6 +46,16 @@ def sampled(baked: TexturedMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return places, shaded / np.linalg.norm(shaded, axis=1, keepdims=True), decode_srgb(baked.base[row, column])
 
 
+def test_shaded_normals_are_those_of_the_full_surface(fields, baked):
+    places, shaded, _ = sampled(baked)
+    wanted = torch.nn.functional.normalize(fields.grid.gradient(torch.from_numpy(places).float()), dim=-1).numpy()
+    smooth = np.linalg.norm(places - [-25, 10, 35], axis=1) < 36  # the large ball, away from the others' edges
+    smooth &= (places[:, 0] < -10) & (places[:, 2] > 8)
+    assert smooth.sum() > 300
+    angle = np.degrees(np.arccos(np.clip((shaded * wanted).sum(1)[smooth], -1, 1)))
+    assert np.median(angle) < 1.5 and np.percentile(angle, 95) < 6
+
+
 def test_the_normal_map_keeps_what_reducing_the_mesh_lost(fields, baked):
     places, shaded, _ = sampled(baked)
     flat = np.cross(*(baked.vertices[baked.faces][:, k] - baked.vertices[baked.faces][:, 0] for k in (1, 2)))
@@ -78,3 +90,8 @@ def test_tangents_follow_the_picture():
     assert np.allclose(np.cross(normals, tangents[:, :3]) * tangents[:, 3:], [0, 0, 1])
     mirrored = vertex_tangents(vertices, normals, uv * [-1, 1] + [1, 0], faces)
     assert np.allclose(mirrored, [-1, 0, 0, -1])
+
+
+def test_a_scene_that_no_photo_saw_is_baked_too(fields, full):
+    dark = replace(fields, albedo=torch.zeros_like(fields.albedo))
+    assert not bake(dark, simplified(full, 500), full, 64).base.any()

@@ -1,12 +1,16 @@
 """Camera and shadow rays of the trainer on a ball, against geometry; its losses where the truth is known."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor, nn
 
 from reconstruct.shadowneus.camera_rays import CameraRays, expected_depth, find_hits
-from reconstruct.shadowneus.config import ABLATIONS, ShadowSamples, TrainConfig, ablated
+from reconstruct.shadowneus.config import ABLATIONS, ShadowSamples, TrainConfig, ablated, shortened_training
+from reconstruct.shadowneus.losses import bound_loss, contain_loss
 from reconstruct.shadowneus.shadow_rays import ShadowRays, light_left, light_left_telescoped, place_samples
+from reconstruct.shadowneus.trainer import learning_factor
 from reconstruct.torch_sdf import equations as render
 
 RADIUS, GROUND, BOUND = 0.6, -0.6, 2.0
@@ -102,6 +106,51 @@ def test_sharp_visibility_is_the_geometric_shadow(way):
     depth = is_blocked(rays)
     clear = depth.abs() > 0.03  # 1/s is 0.003
     assert ((seen < 0.5) == (depth > 0))[clear].all()
+
+
+def test_sampled_and_closed_form_agree_in_value_and_gradient():
+    field, rays, sharpness = Ball(), ground_rays(), torch.tensor(20.0)
+    t, sdf = place_samples(field, rays, BOUND, ShadowSamples(), generator())
+    out = []
+    for seen in (light_left(field, rays, t, sharpness, 1.0), light_left_telescoped(field, rays, t, sdf, sharpness)):
+        (gradient,) = torch.autograd.grad(seen.sum(), field.radius)
+        out.append((seen.detach(), gradient))
+    torch.testing.assert_close(out[0][0], out[1][0], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(out[0][1], out[1][1], atol=1e-3, rtol=1e-3)
+
+
+def test_early_annealing_gives_a_gradient_to_rays_that_leave_the_surface():
+    field = Ball(with_ground=False)
+    up, flat = torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[0.98, 0.0, 0.2]])
+    rays = ShadowRays(RADIUS * up, nn.functional.normalize(flat, dim=-1), up, torch.tensor([5.0]))
+    t, _ = place_samples(field, rays, BOUND, ShadowSamples(), generator())
+    for anneal, blocked in ((1.0, False), (0.0, True)):
+        seen = light_left(field, rays, t, torch.tensor(20.0), anneal)
+        assert (float(seen.detach()) < 0.95) == blocked
+
+
+def test_the_known_ground_and_an_object_inside_the_sphere_cost_nothing():
+    field, rays = Ball(), camera_rays()
+    hits = find_hits(field, rays, BOUND, 256, with_edges=False)
+    on_ball = distance_beside(rays) < 0
+    contain, _ = contain_loss(field, rays, hits, on_ball, BOUND, generator())
+    bound, wrong = bound_loss(field, 500, BOUND, GROUND, generator(), torch.device("cpu"))
+    assert float(contain.detach()) < 1e-6 and float(bound.detach()) == 0 and not len(wrong)
+
+
+def test_the_learning_rate_warms_up_and_falls_to_its_last_value():
+    config = TrainConfig()
+    assert learning_factor(0, config) == 1 / 5000
+    assert learning_factor(5000, config) == 1.0
+    assert math.isclose(learning_factor(150_000, config), 0.05)
+    middle = learning_factor(77_500, config)
+    assert math.isclose(middle, 0.525)
+
+
+def test_a_shorter_training_keeps_the_shape_of_its_schedule():
+    short = shortened_training(TrainConfig(), 1500)
+    assert (short.warm_up, short.cosine_anneal, short.foreground_anneal) == (50, 250, 50)
+    assert short.resolutions == ((0, 8), (50, 4), (100, 2), (150, 1))
 
 
 @pytest.mark.parametrize("name", ABLATIONS)

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from capture.decode import sandbox as confined
+from capture.decode.formats import read_size
 from capture.decode.video import frames_of, read_clip, read_frame
 from capture.errors import CaptureError
 from capture.files.names import frame_path
-from capture.photos.photo import read_photo
+from capture.photos.photo import read_photo, read_stack, read_thumbnail
+from reconstruct.run_folder.folder import content_hash
 
 N_FRAMES, FPS = 60, 25.0
 CODED = 8  # 8-bit steps that a codec may be off by
@@ -59,6 +61,18 @@ def test_the_rotation_in_the_container_is_left_alone(tmp_path):
     clip = read_clip(turned)
     assert (clip.width, clip.height) == (320, 240)
     assert (read_frame(turned, 0.4) == read_frame(plain, 0.4)).all()
+
+
+def test_a_frame_is_a_photo_like_any_other(tmp_path):
+    path = write_counting(tmp_path / "clip.mp4")
+    frame = frame_path(path, 0.8)
+    photo = read_photo(frame)
+    assert not photo.is_linear and photo.taken_s is None and photo.path == frame
+    assert photo.rgb[20, 300] == pytest.approx([0.578, 0.102, 0.021], abs=0.03)  # RGB, not BGR
+    assert read_size(frame) == (320, 240) and read_thumbnail(frame, 80).shape == (60, 80, 3)
+    assert read_stack([frame, frame_path(path, 1.2)], 160).rgb.shape == (2, 120, 160, 3)
+    hashes = content_hash([frame, path])
+    assert len(set(hashes.values())) == 1 and len(hashes) == 2
 
 
 def test_a_time_without_a_frame_and_a_clip_that_went_away_are_refused(tmp_path):

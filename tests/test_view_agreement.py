@@ -60,6 +60,14 @@ def test_an_object_pushed_by_three_millimetres_is_found_and_the_view_is_named(pu
     assert index == pushed or NAMES[pushed] in reason.split("(or it is")[1]
 
 
+def test_what_was_measured_is_how_far_the_object_was_pushed():
+    pictures = [seen(camera_at(a), (4.0, -3.0) if view == 2 else (0.0, 0.0)) for view, a in enumerate(AROUND)]
+    found = odd_one_out(pictures, NAMES)
+    assert found is not None and found[0] == 2
+    assert abs(float(found[1].split("stands ")[1].split(" mm")[0]) - 5.0) < 1.0
+    assert "view_1 and view_2" in found[1]
+
+
 def test_another_object_is_told_from_one_that_moved():
     other = ((0.0, 0.0, 15.0, 15.0), (5.0, 5.0, 25.0, 18.0))
     pictures = [seen(camera_at(a), balls=other if view == 1 else BALLS) for view, a in enumerate(AROUND)]

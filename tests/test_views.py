@@ -14,7 +14,7 @@ from board_photos import board_photo, look_at, slanted
 from calibration.board.board import parse_board
 from calibration.board.board_photos import BoardFit, fit_boards
 from calibration.calibrated_views import CalibratedView, CalibratedViews, load_views, save_views
-from calibration.calibration import Calibration, load_calibration
+from calibration.calibration import Calibration, load_calibration, save_calibration
 from calibration.camera import Camera
 from calibration.light import Light
 from capture.errors import CalibrationError, CaptureError
@@ -132,6 +132,11 @@ def test_a_flat_folder_in_which_the_tripod_was_moved_is_split_by_the_pictures(tm
     assert "2 places of the tripod" in capture.views[0].notes[0]
 
 
+def test_a_tripod_that_was_only_pushed_stays_one_view(tmp_path):
+    capture = load_capture(flat(tmp_path, 2, push_px=9))
+    assert len(capture.views) == 1 and capture.views[0].name == ""
+
+
 # --- the file --------------------------------------------------------------------------------------------------------
 
 
@@ -157,6 +162,13 @@ def test_the_file_of_several_views_returns_them_and_a_reader_of_one_view_finds_t
     assert there.left_out == here.left_out and there.lies[0].name == "turned_1"
     assert there.lies[0].first == here.lies[0].first and load_calibration(path) == here.first
     assert np.allclose(there.views[1].pose_covariance, 1e-4 * np.eye(6))
+
+
+def test_the_file_of_one_view_is_that_of_a_calibration(tmp_path):
+    save_views(CalibratedViews.of(calibration()), tmp_path / "views.json")
+    save_calibration(calibration(), tmp_path / "one.json")
+    assert (tmp_path / "views.json").read_bytes() == (tmp_path / "one.json").read_bytes()
+    assert load_views(tmp_path / "one.json").views[0].name == ""
 
 
 @pytest.mark.parametrize(
