@@ -4,17 +4,18 @@ The file is calibration.json as Calibration writes it, for the first view; those
 `further_views`, those of further lies of the object in `lies`. A reader that knows one view finds the first.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Meta, Struct
 
-from calibration.calibration import Calibration, calibration_document, calibration_of
+from calibration.calibration import Calibration, CalibrationFile, calibration_document
 from capture.files.atomic import write_json
-from capture.files.json_field import JsonField, read_document
+from capture.files.schema import LONGEST_NAME, Text, as_type, check_numbers, read_as, refused
 from capture.session.capture import MOST_LIES, MOST_VIEWS
 
 
@@ -72,7 +73,8 @@ def save_views(views: CalibratedViews, path: Path) -> None:
         CalibrationError: load_views would refuse it; names the field. Nothing is written.
     """
     document = _document(views)
-    _views(JsonField(document, str(path)))
+    check_numbers(document, str(path))
+    as_type(document, _Views, str(path))
     write_json(path, document)
 
 
@@ -82,7 +84,8 @@ def load_views(path: Path) -> CalibratedViews:
     Raises:
         CalibrationError: no such file, or a field is missing, of the wrong kind, or impossible; names the field.
     """
-    return _views(read_document(path))
+    found, document = read_as(path, _Views)
+    return found.views(document)
 
 
 def _document(views: CalibratedViews) -> dict[str, Any]:
@@ -95,31 +98,56 @@ def _document(views: CalibratedViews) -> dict[str, Any]:
     return document | {name: entries for name, entries in more.items() if entries}
 
 
-def _views(document: JsonField) -> CalibratedViews:
-    first = calibration_of(document)
-    views = [CalibratedView(_name(document.get("view", "")), first)]
-    for field in document.get("further_views", []).entries(MOST_VIEWS):
-        found = calibration_of(field)
-        if (found.unit, found.ground_height) != (first.unit, first.ground_height):
-            raise field["ground"].refuse("the unit and the ground of the first view, which all share, were")
-        views.append(CalibratedView(_name(field["view"]), found))
-    names = [view.name for view in views]
-    if len(set(names)) < len(names):
-        raise document["further_views"].refuse("a name of its own for each view was")
-    left_out = [(_name(one["view"]), one["reason"].text()) for one in document.get("left_out", []).entries(MOST_VIEWS)]
-    lies = []
-    for field in document.get("lies", []).entries(MOST_LIES):
-        if isinstance(field.value, dict) and field.value.get("lies"):
-            raise field["lies"].refuse("no lies of a lie were")
-        lies.append(replace(_views(field), name=_name(field["lie"])))
-    return CalibratedViews(tuple(views), tuple(left_out), tuple(lies))
+ViewName = Annotated[
+    str,
+    Meta(
+        pattern=r"\A(?!\.{1,2}(/|\Z))[^/\0]*(?<!\A)(/(?!\.{1,2}\Z)[^/\0]+)?\Z|\A\Z",
+        max_length=LONGEST_NAME,
+        description="the name of a folder",
+    ),
+]  # or of two of them, as turned_1/view_2; "" where there is one view
 
 
-def _name(field: JsonField) -> str:
-    """Return the name of a view: a folder's, or two of them, as turned_1/view_2."""
-    parts = field.text().split("/")
-    if parts == [""]:
-        return ""
-    if len(parts) > 2:
-        raise field.refuse("the name of a folder was")
-    return "/".join(JsonField(part, field.file, field.name, field.advice).file_name() for part in parts)
+class _LeftOut(Struct):
+    view: ViewName
+    reason: Text
+
+
+class _View(CalibrationFile, kw_only=True):
+    view: ViewName = ""
+
+
+class _Views(_View, kw_only=True):
+    """The content of calibration.json, of all views and lies."""
+
+    further_views: Annotated[tuple[_View, ...], Meta(max_length=MOST_VIEWS)] = ()
+    left_out: Annotated[tuple[_LeftOut, ...], Meta(max_length=MOST_VIEWS)] = ()
+    lies: "Annotated[tuple[_Lie, ...], Meta(max_length=MOST_LIES)]" = ()
+
+    def __post_init__(self) -> None:
+        CalibrationFile.__post_init__(self)
+        for k, one in enumerate(self.further_views):
+            if (one.units, one.ground.offset) != (self.units, self.ground.offset):
+                needed = "the unit and the ground of the first view, which all share"
+                raise refused(f"further_views[{k}].ground", one.ground, needed)
+        names = [view.view for view in (self, *self.further_views)]
+        if len(set(names)) < len(names):
+            raise refused("further_views", names, "a name of its own for each view")
+        for k, lie in enumerate(self.lies):
+            if lie.lies:
+                raise refused(f"lies[{k}].lies", lie.lies, "no lies of a lie")
+
+    def views(self, document: Mapping[str, Any], name: str = "") -> CalibratedViews:
+        """Return the views; `document` is the same content in JSON's types."""
+        pairs = zip((self, *self.further_views), (document, *document.get("further_views", ())), strict=True)
+        lies = zip(self.lies, document.get("lies", ()), strict=True)
+        return CalibratedViews(
+            tuple(CalibratedView(one.view, one.calibration(own)) for one, own in pairs),
+            tuple((one.view, one.reason) for one in self.left_out),
+            tuple(lie.views(own, lie.lie) for lie, own in lies),
+            name,
+        )
+
+
+class _Lie(_Views, kw_only=True):
+    lie: ViewName

@@ -1,33 +1,43 @@
 """The complete result of a calibration in one value that can be saved and read back as JSON."""
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from msgspec import Meta, Struct, structs
 
 from calibration.camera import Camera
-from calibration.light import Light, Vector
+from calibration.light import Light
 from calibration.pose import ROTATION_ATOL, Pose
 from calibration.posed_camera import PosedCamera
 from calibration.side_view import LARGEST, SideView, from_run_lengths, run_lengths
 from capture.decode.limits import PIXEL_CAP
 from capture.files.atomic import write_json
-from capture.files.json_field import UNIT_ATOL, JsonField, read_document
-from capture.files.schema import check_numbers
+from capture.files.schema import (
+    FileName,
+    Matrix,
+    Number,
+    Positive,
+    Power,
+    Text,
+    Vector,
+    as_type,
+    check_numbers,
+    read_as,
+    refused,
+)
 
 FORMAT = 1
-UNITS = ("mm", "scene")
+UNIT_ATOL = 1e-6  # of a direction's length: directions are computed in float64 and written in full
+PLACES = {"point": "position", "directional": "direction"}
 MOST_LIGHTS = 5000  # far more than anybody photographs; the page draws each
 MOST_SIDE_VIEWS = 64
 MOST_BEAM_TERMS = 32
 LARGEST_LENGTH = 1e12  # of the world: beyond, a float32 has lost the object
-LARGEST_FOCAL = 1e6  # focal length over the picture's longer side: its rays are parallel to a millionth
-SMALLEST_FOCAL = 1e-3
-LARGEST_DISTORTION = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +50,7 @@ class Calibration:
     lights: tuple[Light, ...]
     unit: str = "mm"  # "mm" | "scene"
     beam: tuple[float, ...] = ()  # profile of the flashlight, see calibration.light.beam_gain; "lobe" in the file
-    ambient: Vector = field(default_factory=lambda: np.zeros(3))  # irradiance of everything but the flashlight
+    ambient: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))  # irradiance of all but the flashlight
     residuals: dict[str, Any] = field(default_factory=dict)  # named numbers for the report: reprojection_rms_px, ...
     side_views: tuple[SideView, ...] = ()  # handheld photos in room light, with the object's silhouette
 
@@ -119,7 +129,8 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
         CalibrationError: load_calibration would refuse it; names the field. Nothing is written.
     """
     document = calibration_document(calibration)
-    calibration_of(JsonField(document, str(path)))
+    check_numbers(document, str(path))
+    as_type(document, CalibrationFile, str(path))
     write_json(path, document)
 
 
@@ -129,7 +140,8 @@ def load_calibration(path: Path) -> Calibration:
     Raises:
         CalibrationError: no such file, or a field is missing, of the wrong kind, or impossible; names the field.
     """
-    return calibration_of(read_document(path))
+    found, document = read_as(path, CalibrationFile)
+    return found.calibration(document)
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
@@ -177,8 +189,7 @@ def _side_document(view: SideView) -> dict[str, Any]:
 
 
 def _light_document(light: Light) -> dict[str, Any]:
-    place = "position" if light.kind == "point" else "direction"
-    names = ("photo", "kind", place, "sigma", "power", "used", "reason", "axis")
+    names = ("photo", "kind", PLACES[light.kind], "sigma", "power", "used", "reason", "axis")
     return {name: getattr(light, name) for name in names}
 
 
@@ -193,97 +204,151 @@ def _plain(value: Any) -> Any:
 
 # --- reading ---------------------------------------------------------------------------------------------------------
 
-
-def calibration_of(document: JsonField) -> Calibration:
-    """Return the calibration that a JSON object describes.
-
-    Raises:
-        CalibrationError: a field is missing, of the wrong kind, or impossible; names the field.
-    """
-    version = document["format"]
-    if version.value != FORMAT:
-        raise version.refuse(f"{FORMAT} was")
-    height = _ground_height(document["ground"])
-    pose = document["camera"]["world_from_camera"]
-    world_from_camera = _pose(pose)
-    if world_from_camera.translation[2] <= height:
-        raise pose.refuse("a camera above the ground was")
-    return Calibration(
-        camera=camera_of(document["camera"], _is_fisheye(document["camera"])),
-        world_from_camera=world_from_camera,
-        ground_height=height,
-        lights=tuple(_light(light, height) for light in document["lights"].entries(MOST_LIGHTS)),
-        unit=document["units"].text(*UNITS),
-        beam=tuple(term.number() for term in document["lobe"].entries(MOST_BEAM_TERMS)),
-        ambient=document["ambient"].not_negative(),
-        residuals=_residuals(document["residuals"]),
-        side_views=_side_views(document, height),
-    )
+Length = Annotated[float, Meta(ge=-LARGEST_LENGTH, le=LARGEST_LENGTH)]
+Place = Annotated[tuple[Length, Length, Length], Meta(description=f"a place within {LARGEST_LENGTH:g} of the origin")]
+Pixel = Annotated[int, Meta(ge=0, le=PIXEL_CAP)]
+Side = Annotated[int, Meta(ge=1, le=LARGEST)]
+Runs = Annotated[list[Annotated[int, Meta(ge=0, le=LARGEST**2)]], Meta(max_length=LARGEST**2)]
 
 
-def _side_views(document: JsonField, ground_height: float) -> tuple[SideView, ...]:
-    return tuple(_side_view(one, ground_height) for one in document.get("side_views", []).entries(MOST_SIDE_VIEWS))
+@dataclass(frozen=True, kw_only=True)
+class _PosedCamera(Camera):
+    world_from_camera: Matrix
+    lens: Literal["pinhole", "fisheye"] = "pinhole"
+
+    def __post_init__(self) -> None:
+        Camera.__post_init__(self)
+        if not is_rigid(np.array(self.world_from_camera)):
+            needed = "a rotation and translation, last row 0 0 0 1"
+            raise refused("world_from_camera", self.world_from_camera, needed)
+
+    def posed(self, ground_height: float) -> PosedCamera:
+        """Return the camera above its ground."""
+        own = {one.name: getattr(self, one.name) for one in fields(Camera)}
+        camera = Camera(**own | {"fisheye": self.lens == "fisheye"})
+        return PosedCamera(camera, Pose.from_matrix(np.array(self.world_from_camera)), ground_height)
 
 
-def _side_view(one: JsonField, ground_height: float) -> SideView:
-    pose = _pose(one["camera"]["world_from_camera"])
-    size = one["size"].entries(2)
-    if len(size) != 2:
-        raise one["size"].refuse("width and height were")
-    width, height = (entry.count(most=LARGEST) for entry in size)
-    masks = []
-    for name in ("object", "sure"):
-        runs = [run.count(0, LARGEST**2) for run in one[name].entries(LARGEST**2)]
-        try:
-            masks.append(from_run_lengths(runs, (height, width)))
-        except ValueError as error:
-            raise one[name].refuse(f"{error} were") from None
-    if len(one["window"].entries(4)) != 4:
-        raise one["window"].refuse("left, top, width and height were")
-    left, top, wide, high = (number.count(0, PIXEL_CAP) for number in one["window"].entries(4))
-    camera = PosedCamera(camera_of(one["camera"], _is_fisheye(one["camera"])), pose, ground_height)
-    if not (0 <= left < left + wide <= camera.camera.width and 0 <= top < top + high <= camera.camera.height):
-        raise one["window"].refuse("left, top, width and height inside the photo were")
-    sigma = one["sigma_px"].number(above=0.0)
-    return SideView(one["photo"].file_name(), camera, (left, top, wide, high), masks[0], masks[1], sigma)
+class _Ground(Struct):
+    normal: Vector
+    offset: Length
+
+    def __post_init__(self) -> None:
+        if np.abs(np.subtract(self.normal, (0, 0, 1))).max() > UNIT_ATOL:
+            raise refused("normal", self.normal, "[0, 0, 1] (the world's z is up)")
 
 
-def _residuals(field: JsonField) -> dict[str, Any]:
-    """Return the residuals after a check of those that are read as lists, tables or numbers."""
-    field.items()
-    check_numbers(field.value, field.file, field.advice, field.name)
-    for name in ("notes", "warnings"):
-        for line in field.get(name, []).entries():
-            line.text()
-    for value in field.get("shading_rms_by_photo", {}).items().values():
-        value.number()
-    for name in ("camera_height_sigma_mm", "given_lights_misfit"):
-        field.get(name, 0.0).number()
-    for row in field.get("board_photos", []).entries():
-        row["photo"].file_name()
-        row["used"].flag()
-        row.get("reason", "").text()
-    for row in field.get("left_out_photos", []).entries():
-        row["photo"].file_name()
-        for name in ("role", "reason"):
-            row[name].text()
-    return field.value
+class _Light(Struct):
+    photo: FileName
+    kind: Literal["point", "directional"]
+    sigma: Power
+    power: Power
+    used: bool
+    reason: Text
+    axis: Vector | None
+    position: Place | None = None
+    direction: Vector | None = None
+
+    def __post_init__(self) -> None:
+        if self.place() is None:
+            raise ValueError(f".{PLACES[self.kind]} is missing")
+        for name in ("axis",) if self.kind == "point" else ("axis", "direction"):
+            vector = getattr(self, name)
+            if vector is not None and abs(np.linalg.norm(vector) - 1) > UNIT_ATOL:
+                raise refused(name, vector, "a direction of length 1")
+
+    def place(self) -> Any:
+        """Return its position or direction."""
+        return getattr(self, PLACES[self.kind])
+
+    def light(self) -> Light:
+        """Return the light."""
+        given = structs.asdict(self) | {"position": None, "direction": None, PLACES[self.kind]: self.place()}
+        return Light(**{name: np.array(one, float) if isinstance(one, tuple) else one for name, one in given.items()})
 
 
-def _ground_height(ground: JsonField) -> float:
-    if np.abs(ground["normal"].unit_vector() - [0, 0, 1]).max() > UNIT_ATOL:
-        raise ground["normal"].refuse("[0, 0, 1] (the world's z is up) was")
-    return ground["offset"].number(most=LARGEST_LENGTH)
+class _SideView(Struct):
+    photo: FileName
+    camera: _PosedCamera
+    window: Annotated[tuple[Pixel, Pixel, Pixel, Pixel], Meta(description="left, top, width and height")]
+    size: Annotated[tuple[Side, Side], Meta(description="width and height")]
+    object: Runs
+    sure: Runs
+    sigma_px: Positive
+
+    def __post_init__(self) -> None:
+        left, top, wide, high = self.window
+        if not (0 < wide <= self.camera.width - left and 0 < high <= self.camera.height - top):
+            raise refused("window", self.window, "left, top, width and height inside the photo")
+        for name in ("object", "sure"):
+            try:
+                self.mask(name)
+            except ValueError as error:
+                raise refused(name, getattr(self, name), str(error)) from None
+
+    def mask(self, name: str) -> Bool[np.ndarray, "height width"]:
+        """Return one of its masks."""
+        return from_run_lengths(getattr(self, name), self.size[::-1])
+
+    def view(self, ground_height: float) -> SideView:
+        """Return the view."""
+        posed = self.camera.posed(ground_height)
+        return SideView(self.photo, posed, self.window, self.mask("object"), self.mask("sure"), self.sigma_px)
 
 
-def _pose(field: JsonField) -> Pose:
-    rows = field.entries(4)
-    if len(rows) != 4:
-        raise field.refuse("4 rows of 4 numbers were")
-    matrix = np.array([row.numbers(4) for row in rows])
-    if not is_rigid(matrix):
-        raise field.refuse("a rotation and translation, last row 0 0 0 1, were")
-    return Pose.from_matrix(matrix)
+class _BoardPhoto(Struct):
+    photo: FileName
+    used: bool
+    reason: Text | None = None
+
+
+class _LeftOutPhoto(Struct):
+    photo: FileName
+    role: Text
+    reason: Text
+
+
+class _Residuals(Struct):  # what is read as lists, tables or numbers; the rest is kept as it is
+    notes: list[Text] | None = None
+    warnings: list[Text] | None = None
+    shading_rms_by_photo: dict[Text, Number] | None = None
+    camera_height_sigma_mm: Number | None = None
+    given_lights_misfit: Number | None = None
+    board_photos: list[_BoardPhoto] | None = None
+    left_out_photos: list[_LeftOutPhoto] | None = None
+
+
+class CalibrationFile(Struct):
+    """The content of calibration.json, of one view."""
+
+    format: Literal[1]
+    units: Literal["mm", "scene"]
+    camera: _PosedCamera
+    ground: _Ground
+    lights: Annotated[list[_Light], Meta(max_length=MOST_LIGHTS)]
+    lobe: Annotated[tuple[Number, ...], Meta(max_length=MOST_BEAM_TERMS)]
+    ambient: Power
+    residuals: _Residuals
+    side_views: Annotated[tuple[_SideView, ...], Meta(max_length=MOST_SIDE_VIEWS)] = ()
+
+    def __post_init__(self) -> None:
+        if self.camera.world_from_camera[2][3] <= self.ground.offset:
+            raise refused("camera.world_from_camera", self.camera.world_from_camera, "a camera above the ground")
+        for k, light in enumerate(self.lights):
+            if light.used and light.place()[2] <= (self.ground.offset if light.kind == "point" else 0.0):
+                raise refused(f"lights[{k}].{PLACES[light.kind]}", light.place(), "a light above the ground")
+
+    def calibration(self, document: Mapping[str, Any]) -> Calibration:
+        """Return the calibration; `document` is the same content in JSON's types, whose residuals are kept whole."""
+        return Calibration.of(
+            self.camera.posed(self.ground.offset),
+            [light.light() for light in self.lights],
+            unit=self.units,
+            beam=self.lobe,
+            ambient=np.array(self.ambient),
+            residuals=document["residuals"],
+            side_views=tuple(view.view(self.ground.offset) for view in self.side_views),
+        )
 
 
 def is_rigid(matrix: Float[np.ndarray, "4 4"]) -> bool:
@@ -292,66 +357,3 @@ def is_rigid(matrix: Float[np.ndarray, "4 4"]) -> bool:
         return False
     rotation = matrix[:3, :3]
     return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() <= ROTATION_ATOL and np.linalg.det(rotation) > 0)
-
-
-def camera_of(field: JsonField, is_fisheye: bool) -> Camera:
-    """Return the camera that a JSON object describes by the names of Camera's fields.
-
-    Raises:
-        CalibrationError: a number is missing, or is none that a camera has; names it.
-    """
-    width, height = field["width"].count(), field["height"].count()
-    if width * height > PIXEL_CAP:
-        raise field["width"].refuse(f"at most {PIXEL_CAP // 1_000_000} megapixels of {height} rows were")
-    longer = max(width, height)
-    fx, fy = (_focal(field[name], longer) for name in ("fx", "fy"))
-    cx, cy = (field[name].number(most=LARGEST_FOCAL * longer) for name in ("cx", "cy"))
-    k1, k2, p1, p2, k3 = (entry.number(most=LARGEST_DISTORTION) for entry in _five(field["distortion"]))
-    sigmas = {name: entry.number() for name, entry in field["sigmas"].items().items()}
-    for name, value in sigmas.items():
-        if value < 0:
-            raise field["sigmas"][name].refuse(f"a number from 0, not {value}, was")
-    return Camera(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3), sigmas, is_fisheye)
-
-
-def _focal(field: JsonField, longer: int) -> float:
-    value = field.number(above=0.0)
-    if not SMALLEST_FOCAL * longer <= value <= LARGEST_FOCAL * longer:
-        raise field.refuse(f"{SMALLEST_FOCAL:g} to {LARGEST_FOCAL:g} times the {longer} pixels of the picture were")
-    return value
-
-
-def _five(field: JsonField) -> list[JsonField]:
-    entries = field.entries(5)
-    if len(entries) != 5:
-        raise field.refuse("a list of 5 numbers was")
-    return entries
-
-
-def _is_fisheye(camera: JsonField) -> bool:
-    return "lens" in camera.value and camera["lens"].text("pinhole", "fisheye") == "fisheye"
-
-
-def _light(field: JsonField, ground_height: float) -> Light:
-    kind = field["kind"].text("point", "directional")
-    if type(field["used"].value) is not bool:
-        raise field["used"].refuse("true or false was")
-    place = field["position"] if kind == "point" else field["direction"]
-    vector = place.vector() if kind == "point" else place.unit_vector()
-    if np.abs(vector).max() > LARGEST_LENGTH:
-        raise place.refuse(f"a place within {LARGEST_LENGTH:g} of the origin was")
-    lowest = ground_height if kind == "point" else 0.0
-    if field["used"].value and vector[2] <= lowest:
-        raise place.refuse("a light above the ground was")
-    axis = field["axis"]
-    return Light(
-        photo=field["photo"].file_name(),
-        kind=kind,
-        position=vector if kind == "point" else None,
-        direction=vector if kind == "directional" else None,
-        power=field["power"].not_negative(),
-        axis=None if axis.value is None else axis.unit_vector(),
-        sigma=field["sigma"].not_negative(),
-        used=field["used"].value,
-        reason=field["reason"].text(),
-    )

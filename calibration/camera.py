@@ -2,13 +2,22 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Annotated
 
 import cv2
 import numpy as np
 from jaxtyping import Float
+from msgspec import Meta
+
+from capture.decode.limits import PIXEL_CAP
+from capture.files.schema import NotNegative, Number, Positive, Text, refused
 
 # OpenCV's own five rounds leave up to 4 px at the corners of wide lenses; these end at a millionth of a pixel.
 UNDISTORT_UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)
+LARGEST_FOCAL = 1e6  # focal length over the picture's longer side: its rays are parallel to a millionth
+SMALLEST_FOCAL = 1e-3
+LARGEST_DISTORTION = 1e6
+Term = Annotated[float, Meta(ge=-LARGEST_DISTORTION, le=LARGEST_DISTORTION)]
 FIELD_MARGIN = 1.1  # of the tangent at the picture's corners: distortion is still followed there
 
 
@@ -22,17 +31,25 @@ class Camera:
 
     width: int
     height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    sigmas: dict[str, float] = field(default_factory=dict)  # one sigma of fx, cx, cy (px); empty when given as exact
+    fx: Positive
+    fy: Positive
+    cx: Number
+    cy: Number
+    distortion: tuple[Term, Term, Term, Term, Term] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    sigmas: dict[Text, NotNegative] = field(default_factory=dict)  # of fx, cx, cy (px); empty when given as exact
     fisheye: bool = False
 
     def __post_init__(self):
         if min(self.width, self.height) < 1 or not (self.fx > 0 and self.fy > 0):
             raise ValueError("a camera needs a positive size and focal length")
+        if self.width * self.height > PIXEL_CAP:
+            raise refused("width", self.width, f"at most {PIXEL_CAP // 1_000_000} megapixels of {self.height} rows")
+        longer = max(self.width, self.height)
+        if not SMALLEST_FOCAL <= min(self.fx, self.fy) / longer <= max(self.fx, self.fy) / longer <= LARGEST_FOCAL:
+            needed = f"{SMALLEST_FOCAL:g} to {LARGEST_FOCAL:g} times the {longer} pixels of the picture, as fy"
+            raise refused("fx", self.fx, needed)
+        if max(abs(self.cx), abs(self.cy)) > LARGEST_FOCAL * longer:
+            raise refused("cx", self.cx, "a principal point near the picture, as cy")
 
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         """Return OpenCV's camera matrix K, px."""

@@ -5,21 +5,22 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from msgspec import Meta, Struct
 from torch import Tensor
 
-from calibration.calibration import LARGEST_LENGTH, MOST_LIGHTS, UNITS, camera_of, is_rigid
+from calibration.calibration import LARGEST_LENGTH, MOST_LIGHTS, Length, is_rigid
 from calibration.camera import Camera
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError, ReconstructionError
 from capture.files.atomic import atomic_file
-from capture.files.json_field import JsonField
 from capture.files.regular import why
+from capture.files.schema import Number, Text, as_type
 from capture.session.capture import MOST_VIEWS
 from reconstruct.appearance.brdf import LOBES, Gloss
 from reconstruct.sdf.carried import carried
@@ -59,9 +60,9 @@ LAYOUTS |= {
 class Verdict:
     """Mean |T - label| of held-out shadow rays, with the surface settled under either set of lights."""
 
-    calibrated: float
-    refined: float
-    noise: float  # one sigma of the difference, from how it varies between photos
+    calibrated: Number
+    refined: Number
+    noise: Number  # one sigma of the difference, from how it varies between photos
 
     @property
     def is_accepted(self) -> bool:
@@ -248,6 +249,23 @@ def _further_tensors(view: FurtherView) -> dict[str, Tensor]:
     return found
 
 
+class _ViewHeader(Struct, kw_only=True):
+    camera: Camera
+    name: Text = ""
+
+
+class _Header(_ViewHeader, kw_only=True):
+    spacing: Annotated[float, Meta(ge=1 / LARGEST_LENGTH, le=LARGEST_LENGTH)]
+    ground_height: Length
+    unit: Literal["mm", "scene"]
+    light_trial: Verdict | None = None
+    doubts: tuple[Text, ...] = ()
+    interreflection: Number = 0.0
+    light_share: Number = 0.0
+    view: Text = ""
+    further: Annotated[tuple[_ViewHeader, ...], Meta(max_length=MOST_VIEWS - 1)] = ()
+
+
 def load_fields(path: Path) -> Fields:
     """Read Fields from a file written by save_fields, which may be a stranger's.
 
@@ -258,28 +276,24 @@ def load_fields(path: Path) -> Fields:
     try:
         stored = read_tensors(path, LAYOUTS, MOST_NUMBERS)
         if stored.header.get("format") != FORMAT:
-            raise ReconstructionError(
-                f"{path}: format {stored.header.get('format')!r} found, {FORMAT!r} needed; {MAKE}"
-            )
-        return _checked(stored.tensors, JsonField(parsed(stored.header, "fields"), str(path), "the header", MAKE))
+            raise ValueError(f"format {stored.header.get('format')!r} found, {FORMAT!r} needed")
+        return _checked(stored.tensors, as_type(parsed(stored.header, "fields"), _Header, f"{path}: the header", MAKE))
     except CalibrationError as error:
         raise ReconstructionError(str(error)) from error
     except (OSError, ValueError) as error:
         raise ReconstructionError(f"{path}: not a readable result ({why(error)}); {MAKE}") from error
 
 
-def _checked(tensors: Mapping[str, Tensor], rest: JsonField) -> Fields:
+def _checked(tensors: Mapping[str, Tensor], rest: _Header) -> Fields:
     """Return the fields of a file.
 
     Raises:
         ValueError, CalibrationError: they are none that a solve leaves.
     """
-    grid = checked_grid(tensors["sdf"], tensors["origin"], rest["spacing"])
+    grid = checked_grid(tensors["sdf"], tensors["origin"], rest.spacing)
     refuse_outside(tensors, 0.0, BRIGHTEST, "lobes", "evidence")
-    ground = rest["ground_height"]
-    first = _checked_view(tensors, rest, grid, ground)
-    views = rest.get("further", []).entries(MOST_VIEWS - 1)
-    further = [_checked_view(tensors, view, grid, ground, number) for number, view in enumerate(views, 1)]
+    views = enumerate((rest, *rest.further))
+    first, *further = (_checked_view(tensors, view, grid, rest.ground_height, number) for number, view in views)
     for one in (first, *further):
         weights, lobes = one.gloss_weights, tensors.get("lobes")
         if lobes is not None and weights is not None and weights.shape[2] != len(lobes):
@@ -292,29 +306,29 @@ def _checked(tensors: Mapping[str, Tensor], rest: JsonField) -> Fields:
         first.albedo,
         first.camera,
         first.world_from_camera,
-        ground.number(),
-        rest["unit"].text(*UNITS),
+        rest.ground_height,
+        rest.unit,
         first.lights,
         gloss,
         tensors["evidence"].float() if "evidence" in tensors else None,
-        _verdict(rest.get("light_trial", {})),
-        tuple(doubt.text() for doubt in rest.get("doubts", []).entries()),
-        rest.get("interreflection", 0.0).number(most=BRIGHTEST),
-        rest.get("view", "").text(),
+        rest.light_trial,
+        rest.doubts,
+        rest.interreflection,
+        rest.view,
         tuple(further),
-        light_share=rest.get("light_share", 0.0).number(most=BRIGHTEST),
+        light_share=rest.light_share,
     )
 
 
 def _checked_view(
-    tensors: Mapping[str, Tensor], rest: JsonField, grid: SdfGrid, ground: JsonField, number: int = 0
+    tensors: Mapping[str, Tensor], rest: _ViewHeader, grid: SdfGrid, ground: float, number: int
 ) -> FurtherView:
     """Return what the camera of this number saw; 0 is the first.
 
     Raises:
         ValueError, CalibrationError: as of `_checked`.
     """
-    camera = camera_of(rest["camera"], rest["camera"].get("fisheye", False).flag())
+    camera = rest.camera
     albedo_name, pose_name, lights_name, weights_name = (f"{name}_{number}" if number else name for name in OF_A_VIEW)
     if albedo_name not in tensors or pose_name not in tensors:
         raise ValueError(f"the tensors {albedo_name!r} and {pose_name!r} were needed")
@@ -323,54 +337,46 @@ def _checked_view(
         pixels = f"{albedo.shape[1]} x {albedo.shape[0]} pixels of albedo"
         raise ValueError(f"{pixels} were found, {camera.width} x {camera.height} as of the camera were needed")
     refuse_outside(tensors, 0.0, BRIGHTEST, albedo_name, weights_name)
-    refuse_outside(tensors, -LARGEST_LENGTH, LARGEST_LENGTH, lights_name, pose_name)
-    if not is_rigid(tensors[pose_name].numpy()):
-        raise ValueError(f"{pose_name} is no rotation and translation")
-    pose = Pose.from_matrix(tensors[pose_name].numpy())
-    motion = _motion(tensors, f"{OF_A_LIE}_{number}")
+    refuse_outside(tensors, -LARGEST_LENGTH, LARGEST_LENGTH, lights_name)
+    pose, lie = _pose(tensors, pose_name), f"{OF_A_LIE}_{number}"
+    motion = _pose(tensors, lie) if lie in tensors else None
     reach = MOST_BOXES * grid.spacing * max(grid.values.shape)
     place = pose.translation if motion is None else motion.apply(pose.translation)
     if np.abs(place - grid.origin.double().numpy()).max() > reach:
         raise ValueError(f"the camera is farther than {MOST_BOXES:g} times the grid's size from it")
-    if not pose.translation[2] > ground.number(most=LARGEST_LENGTH):
-        raise ground.refuse("a camera above the ground was")
+    if not pose.translation[2] > ground:
+        raise ValueError(f"the ground is at {ground:g}, a camera above the ground was needed")
     lights = tensors.get(lights_name)
     if lights is not None and not 0 < len(lights) <= MOST_LIGHTS:
         raise ValueError(f"{len(lights)} lights were found, at most {MOST_LIGHTS} were needed")
-    weights = tensors.get(weights_name)
+    weights = tensors[weights_name].float() if weights_name in tensors else None
     if weights is not None and tuple(weights.shape[:2]) != (camera.height, camera.width):
         raise ValueError(f"weights of lobes of shape {tuple(weights.shape)} were found, of each pixel needed")
-    name = rest.get("name", "").text()
-    return FurtherView(name, albedo.float(), camera, pose, lights, None if weights is None else weights.float(), motion)
+    return FurtherView(rest.name, albedo.float(), camera, pose, lights, weights, motion)
 
 
-def _motion(tensors: Mapping[str, Tensor], name: str) -> Pose | None:
-    """Return the rigid motion of this name; None if there is none.
+def _pose(tensors: Mapping[str, Tensor], name: str) -> Pose:
+    """Return the rigid motion of this name.
 
     Raises:
-        ValueError: it is no rigid motion.
+        ValueError: it is none.
     """
-    if name not in tensors:
-        return None
     refuse_outside(tensors, -LARGEST_LENGTH, LARGEST_LENGTH, name)
     if not is_rigid(tensors[name].numpy()):
         raise ValueError(f"{name} is no rotation and translation")
     return Pose.from_matrix(tensors[name].numpy())
 
 
-def checked_grid(values: Tensor, origin: Tensor, spacing: JsonField) -> SdfGrid:
+def checked_grid(values: Tensor, origin: Tensor, step: float) -> SdfGrid:
     """Return a stored SDF after a check that it is finite, of a world's size, and changes no faster than a distance.
 
     Raises:
         ValueError, CalibrationError: it is not.
     """
-    step = spacing.number(above=0.0, most=LARGEST_LENGTH)
     if values.ndim != 3 or tuple(origin.shape) != (3,) or {values.dtype, origin.dtype} != {torch.float32}:
         raise ValueError(f"an SDF of shape {tuple(values.shape)} was found, float32 in three dimensions was needed")
     if min(values.shape) < 2 or values.numel() > MOST_NODES:
         raise ValueError(f"a grid of {tuple(values.shape)} nodes was found, 2 to {MOST_NODES:,} nodes were needed")
-    if step < 1 / LARGEST_LENGTH:
-        raise spacing.refuse(f"at least {1 / LARGEST_LENGTH:g} was")
     far = MOST_BOXES * step * max(values.shape)
     refuse_outside({"sdf": values}, -far, far, "sdf")
     refuse_outside({"origin": origin}, -far, far, "origin")
@@ -392,9 +398,3 @@ def _gloss(tensors: Mapping[str, Tensor]) -> Gloss | None:
     if "lobes" not in tensors:
         return None
     return Gloss(tensors["lobes"], tensors["lobe_weights"].float())
-
-
-def _verdict(field: JsonField) -> Verdict | None:
-    if not field.items():
-        return None
-    return Verdict(*(field[name].number() for name in ("calibrated", "refined", "noise")))

@@ -55,7 +55,7 @@ def test_the_file_keeps_the_contract(tmp_path):
         (("camera", "fx"), -3, "camera.fx"),
         (("camera", "width"), 640.5, "camera.width"),
         (("camera", "distortion"), [0, 0], "camera.distortion"),
-        (("camera", "sigmas", "fx"), -1, "camera.sigmas.fx"),
+        (("camera", "sigmas", "fx"), -1, r"camera.sigmas is .*in each entry"),
         (("camera", "world_from_camera", 0, 0), 3.0, "camera.world_from_camera"),
         (("camera", "world_from_camera", 2, 3), -50.0, "camera.world_from_camera"),
         (("camera", "world_from_camera", 3), [0, 0, 1, 1], "camera.world_from_camera"),

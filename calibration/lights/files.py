@@ -19,8 +19,10 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from calibration.calibration import load_calibration
 from calibration.light import Light, Vector
@@ -29,7 +31,8 @@ from calibration.lights.number_lists import READABLE, number_rows
 from calibration.lights.photo_lists import bare
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
-from capture.files.json_field import LARGEST_FILE, JsonField, read_json, read_text
+from capture.files.schema import EXPORT, LARGEST_FILE, MOST_ENTRIES, Power, Text, as_type, read_json, read_text, refused
+from capture.files.schema import Vector as Numbers
 
 
 class NoMatchError(CalibrationError):
@@ -68,17 +71,16 @@ def read_lights(path: Path, photos: Sequence[str], posed_camera: PosedCamera, ev
     if is_number_list(path):
         return _matched(number_rows(path, posed_camera), photos, path, every)
     content = read_json(path)
-    document = JsonField(content, str(path))
     if "format" in content and "camera" in content:
         return _own(path, photos)
     if "lights" in content:
-        return _listed(document, photos, path)
+        return _listed(content, photos, path)
     if "light_pos" in content:
-        return _matched(s3nerf_rows(document, posed_camera), photos, path, every)
+        return _matched(s3nerf_rows(content, path, posed_camera), photos, path, every)
     if "frames" in content:
-        return _matched(shadowneus_rows(document, path, posed_camera), photos, path, every)
+        return _matched(shadowneus_rows(content, path, posed_camera), photos, path, every)
     if "directions" in content or "positions3d" in content or "positions" in content:
-        return _matched(dome_rows(document, posed_camera), photos, path, every)
+        return _matched(dome_rows(content, path, posed_camera), photos, path, every)
     raise CalibrationError(
         f"{path} is of no known kind (its entries: {', '.join(list(content)[:6]) or 'none'}). {READABLE}."
     )
@@ -113,8 +115,9 @@ def read_opinions(path: Path) -> tuple[Light, ...] | None:
     content = read_json(path)
     if "lights" not in content or "camera" in content:
         return None
-    lights = _entries(JsonField(content, str(path)))
-    has_power = any("power" in entry for entry in content["lights"])
+    listed = as_type(content, _List, str(path), EXPORT).lights
+    lights = tuple(one.light() for one in listed)
+    has_power = any(one.power for one in listed)
     is_opinion = not has_power and all(x.position is not None and (x.sigma > 0).all() for x in lights)
     return lights if lights and is_opinion else None
 
@@ -128,29 +131,37 @@ def _own(path: Path, photos: Sequence[str]) -> GivenLights:
     return GivenLights(lights, True, given.beam, given.ambient)
 
 
-def _listed(document: JsonField, photos: Sequence[str], path: Path) -> GivenLights:
-    lights, entries = _entries(document), document["lights"].entries()
-    has_power = bool(entries) and all("power" in entry.value for entry in entries)
+class _Entry(Struct):
+    """A light of a plain list; defaults are power 1 and no sigma."""
+
+    photo: Text
+    position: Numbers | None = None
+    direction: Numbers | None = None
+    sigma: Power | None = None
+    power: Power | None = None
+
+    def __post_init__(self) -> None:
+        if self.position is None and not any(self.direction or ()):
+            raise refused("direction", self.direction, "a position or a direction")
+
+    def light(self) -> Light:
+        """Return the light."""
+        sigma, power = np.array(self.sigma or np.zeros(3)), np.array(self.power or np.ones(3))
+        if self.position is not None:
+            return Light(self.photo, "point", position=np.array(self.position), sigma=sigma, power=power)
+        towards = np.array(self.direction)
+        return Light(self.photo, "directional", direction=towards / np.linalg.norm(towards), sigma=sigma, power=power)
+
+
+class _List(Struct):
+    lights: Annotated[list[_Entry], Meta(max_length=MOST_ENTRIES)]
+
+
+def _listed(content: Any, photos: Sequence[str], path: Path) -> GivenLights:
+    listed = as_type(content, _List, str(path), EXPORT).lights
+    lights = [one.light() for one in listed]
+    has_power = bool(listed) and all(one.power for one in listed)
     return GivenLights(_by_name(lights, [light.photo for light in lights], photos, path), has_power)
-
-
-def _entries(document: JsonField) -> tuple[Light, ...]:
-    """Return the lights of a plain list; defaults are power 1 and no sigma."""
-    lights = []
-    for entry in document["lights"].entries():
-        fields = entry.value if isinstance(entry.value, dict) else {}
-        is_point = "position" in fields
-        lights.append(
-            Light(
-                entry["photo"].text(),
-                "point" if is_point else "directional",
-                position=entry["position"].vector() if is_point else None,
-                direction=None if is_point else _unit(entry["direction"].vector(), entry["direction"]),
-                sigma=entry["sigma"].not_negative() if "sigma" in fields else np.zeros(3),
-                power=entry["power"].not_negative() if "power" in fields else np.ones(3),
-            )
-        )
-    return tuple(lights)
 
 
 def _by_name(lights: Sequence[Light], names: Sequence[str], photos: Sequence[str], path: Path) -> tuple[Light, ...]:
@@ -197,10 +208,3 @@ def _numbers(photos: Sequence[str], first: int, n_rows: int) -> list[int] | None
     rows = [int(digits[-1]) - first for digits in found if digits]
     fits = len(rows) == len(photos) and len(set(rows)) == len(rows) and min(rows) >= 0 and max(rows) < n_rows
     return rows if fits else None
-
-
-def _unit(value: Vector, field: JsonField) -> Vector:
-    length = float(np.linalg.norm(value))
-    if length == 0:
-        raise field.refuse("a direction was")
-    return value / length

@@ -6,20 +6,32 @@ Scenes with a camera of their own (ShadowNeuS, S3-NeRF) are placed by it.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Meta, Struct, ValidationError, convert, structs
 
-from calibration.light import Light, Vector
+from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.files.arrays import read_npz
-from capture.files.json_field import JsonField, read_json
+from capture.files.schema import (
+    EXPORT,
+    MOST_ENTRIES,
+    Matrix,
+    NotNegative,
+    Number,
+    Text,
+    Vector,
+    as_type,
+    read_scene,
+    refused,
+)
 
-PLACE_KEYS = ("positions3d", "positionsSphere", "positions")  # of a dome
-BLENDER = np.diag([1.0, -1.0, -1.0])  # OpenCV camera axes from those of Blender and OpenGL, and from the picture's
+FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])  # the same as a motion
+BLENDER = FROM_BLENDER[:3, :3]  # OpenCV camera axes from those of Blender and OpenGL, and from the picture's
 ROTATION_ERROR = 1e-3  # exporters round to six digits, or write float32
 
 
@@ -55,36 +67,47 @@ def view_note(posed_camera: PosedCamera) -> str:
     return f"lights: directions are read in the picture's axes; the camera looks {tilt:.0f} degrees off straight down"
 
 
-def dome_rows(document: JsonField, posed_camera: PosedCamera) -> Rows:
+class _Xyz(Struct):
+    x: Number
+    y: Number
+    z: Number
+
+
+Vectors = Annotated[tuple[Vector | _Xyz, ...], Meta(max_length=MOST_ENTRIES)]
+
+
+class _Dome(Struct, rename="camel"):
+    directions: Vectors = ()
+    positions: Vectors = ()
+    positions3d: Vectors = ()
+    positions_sphere: Vectors = ()
+    light_configuration: Text = "directional"
+    image_width: NotNegative = 0.0
+
+
+def dome_rows(content: Any, path: Path, posed_camera: PosedCamera) -> Rows:
     """Parse RelightLab's dome. Its lengths are cm or mm by version; over imageWidth they need no unit.
 
     Raises:
         CalibrationError: no lights, or places without a scale.
     """
-    content = document.value
-    layout = document["lightConfiguration"].text() if "lightConfiguration" in content else "directional"
-    key = {"spherical": "positionsSphere", "lights3d": "positions3d"}.get(layout, "directions")
-    key = "positions" if key != "directions" and key not in content and "positions" in content else key
-    width = document["imageWidth"].number() if "imageWidth" in content else 0.0
-    is_point = key != "directions" and width > 0 and bool(content.get(key))
-    if not is_point and not content.get("directions") and any(content.get(n) for n in PLACE_KEYS):
-        raise CalibrationError(f"{document.file}: positions without 'imageWidth' have no scale; it was needed.")
-    vectors = np.array([_xyz(entry) for entry in document[key if is_point else "directions"].entries()])
+    dome = as_type(content, _Dome, str(path), EXPORT)
+    layout = {"spherical": dome.positions_sphere, "lights3d": dome.positions3d}
+    places = layout.get(dome.light_configuration) or (dome.positions if dome.light_configuration in layout else ())
+    is_point = bool(places) and dome.image_width > 0
+    if not is_point and not dome.directions and (dome.positions or dome.positions3d or dome.positions_sphere):
+        raise CalibrationError(f"{path}: positions without 'imageWidth' have no scale; it was needed.")
+    given = places if is_point else dome.directions
+    vectors = np.array([structs.astuple(one) if isinstance(one, _Xyz) else one for one in given])
     if not vectors.size or not np.linalg.norm(vectors, axis=1).all():
-        raise CalibrationError(f"{document.file}: no direction or position per light, one for each photo was needed.")
+        raise CalibrationError(f"{path}: no direction or position per light, one for each photo was needed.")
     values = turned(vectors, posed_camera)
     if is_point:
         middle = posed_camera.looked_at()
         reach = float(np.linalg.norm(middle - posed_camera.centre))
-        values = middle + values * (reach * posed_camera.camera.width / posed_camera.camera.fx / width)
+        values = middle + values * (reach * posed_camera.camera.width / posed_camera.camera.fx / dome.image_width)
     kind = "point" if is_point else "directional"
     return Rows((None,) * len(values), values, kind, note=view_note(posed_camera))
-
-
-def _xyz(entry: JsonField) -> Vector:
-    if isinstance(entry.value, dict):
-        return np.array([entry[axis].number() for axis in "xyz"])
-    return entry.vector()
 
 
 # --- scenes with a camera of their own -------------------------------------------------------------------------------
@@ -120,18 +143,6 @@ def rigid(matrix: Any, file: str, name: str) -> Pose:
     raise CalibrationError(f"{file}: {name} is not a 4 x 4 matrix of rotation and translation; export it again.")
 
 
-def _matrix(field: JsonField) -> Float[np.ndarray, "4 4"]:
-    """Four rows of four numbers.
-
-    Raises:
-        CalibrationError: names the field.
-    """
-    rows = field.entries()
-    if len(rows) != 4:
-        raise field.refuse("4 rows of 4 numbers were")
-    return np.array([row.numbers(4) for row in rows])
-
-
 def shadowneus_real_rows(path: Path, posed_camera: PosedCamera) -> Rows:
     """ShadowNeuS' params.npz of real photos: light_pose, camera_pose (OpenCV axes), floor_height.
 
@@ -147,22 +158,51 @@ def shadowneus_real_rows(path: Path, posed_camera: PosedCamera) -> Rows:
     return Rows((None,) * len(values), values, "point", first=0)
 
 
-def shadowneus_rows(document: JsonField, path: Path, posed_camera: PosedCamera) -> Rows:
+class Frame(Struct):
+    """A photo in ShadowNeuS' transforms_*.json."""
+
+    file_path: Text
+    transform_matrix: Matrix
+    transform_matrix_sun: list[Any]  # a matrix; after reading the list of them, because a photo may have several lights
+
+    def __post_init__(self) -> None:
+        given = self.transform_matrix_sun
+        is_list = bool(given) and isinstance(given[0], list) and bool(given[0]) and isinstance(given[0][0], list)
+        try:
+            self.transform_matrix_sun = convert(given if is_list else [given], list[Matrix])
+        except ValidationError:
+            raise refused("transform_matrix_sun", given, "4 rows of 4 numbers") from None
+
+
+class Frames(Struct, kw_only=True):
+    """The content of transforms_*.json."""
+
+    frames: Annotated[list[Frame], Meta(min_length=1, max_length=MOST_ENTRIES)]
+    light_type: Literal["point", "directional"] | None = None
+
+
+class _FloorFrame(Struct):
+    transform_ground: Matrix
+
+
+class Floor(Struct):
+    """The content of transforms_floor.json."""
+
+    frames: Annotated[list[_FloorFrame], Meta(min_length=1, description="one entry with transform_ground")]
+
+
+def shadowneus_rows(content: Any, path: Path, posed_camera: PosedCamera) -> Rows:
     """Parse ShadowNeuS' transforms_*.json; transforms_floor.json beside it gives the scale.
 
     Raises:
         CalibrationError: a field is missing or impossible.
     """
-    frames = document["frames"].entries()
-    if not frames:
-        raise document["frames"].refuse("one entry for each photo was")
-    matrices = [_matrix(frame["transform_matrix_sun"]) for frame in frames]
-    pose = rigid(
-        _matrix(frames[0]["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0]), str(path), "transform_matrix"
-    )
-    names = tuple(frame["file_path"].text() for frame in frames)
-    if document.value.get("light_type") == "directional":
-        towards = np.stack([matrix[:3, 2] for matrix in matrices])
+    given = as_type(content, Frames, str(path), EXPORT)
+    suns = [(frame.file_path, sun) for frame in given.frames for sun in frame.transform_matrix_sun]
+    names, matrices = tuple(name for name, _ in suns), np.array([sun for _, sun in suns])
+    pose = rigid(np.array(given.frames[0].transform_matrix) @ FROM_BLENDER, str(path), "transform_matrix")
+    if given.light_type == "directional":
+        towards = matrices[:, :3, 2]
         if not np.linalg.norm(towards, axis=1).all():
             raise CalibrationError(f"{path}: a 'transform_matrix_sun' has no direction; export it again.")
         turned = posed_camera.world_from_camera.rotate(pose.inverse().rotate(towards))
@@ -170,24 +210,32 @@ def shadowneus_rows(document: JsonField, path: Path, posed_camera: PosedCamera) 
     floor_file = path.with_name("transforms_floor.json")
     floor = None
     if floor_file.is_file():
-        grounds = JsonField(read_json(floor_file), str(floor_file))["frames"]
-        if not grounds.entries():
-            raise grounds.refuse("one entry with transform_ground was")
-        floor = float(_matrix(grounds.entries()[0]["transform_ground"])[2, 3])
-    values = _placed(np.stack([matrix[:3, 3] for matrix in matrices]), pose, floor, posed_camera, str(floor_file))
+        floor = read_scene(floor_file, Floor).frames[0].transform_ground[2][3]
+    values = _placed(matrices[:, :3, 3], pose, floor, posed_camera, str(floor_file))
     return Rows(names, values, "point", first=0)
 
 
-def s3nerf_rows(document: JsonField, posed_camera: PosedCamera) -> Rows:
+class _Lamps(Struct):
+    pose_c2w: Matrix
+    light_pos: Annotated[list[Vector], Meta(min_length=1, description="one place for each photo")]
+
+
+def s3nerf_rows(content: Any, path: Path, posed_camera: PosedCamera) -> Rows:
     """S3-NeRF's params.json: light_pos in a world whose camera pose_c2w looks along its -z.
 
     Raises:
         CalibrationError: a field is missing or impossible.
     """
-    places = np.array([entry.numbers(3) for entry in document["light_pos"].entries()])
-    if not len(places):
-        raise document["light_pos"].refuse("one place for each photo was")
-    pose = rigid(_matrix(document["pose_c2w"]) @ np.diag([1.0, -1.0, -1.0, 1.0]), document.file, "pose_c2w")
-    values = _placed(places, pose, None, posed_camera, document.file)
+    pose, places = lamps(content, path)
     note = "lights: the file gives no height of its camera, so its lengths are read in the unit of this capture"
-    return Rows((None,) * len(values), values, "point", note=note)
+    return Rows((None,) * len(places), _placed(places, pose, None, posed_camera, str(path)), "point", note=note)
+
+
+def lamps(content: Any, path: Path) -> tuple[Pose, Float[np.ndarray, "rows 3"]]:
+    """Return the camera's pose (OpenCV axes) and the lights' places in S3-NeRF's params.json.
+
+    Raises:
+        CalibrationError: a field is missing or impossible.
+    """
+    given = as_type(content, _Lamps, str(path), EXPORT)
+    return rigid(np.array(given.pose_c2w) @ FROM_BLENDER, str(path), "pose_c2w"), np.array(given.light_pos)

@@ -14,7 +14,7 @@ from calibration.lights.layouts import Rows, turned, view_note
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.files.arrays import read_mat, read_npy
-from capture.files.json_field import read_text
+from capture.files.schema import read_text
 
 READABLE = (
     "Lights are read from .lp, .txt and .csv lists, .mat, .npy, .dome, lights.json, calibration.json and the files of "

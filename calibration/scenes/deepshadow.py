@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from msgspec import Struct
 
 from calibration.calibration import Calibration
 from calibration.camera import Camera
@@ -12,8 +13,8 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.scenes.distant_camera import LOOKING_DOWN
 from capture.errors import CalibrationError
-from capture.files.json_field import JsonField, read_object, read_text
 from capture.files.names import inside
+from capture.files.schema import Number, Positive, read_scene, read_text
 from capture.photos.photo import read_grey
 from capture.session.scene_photos import scene_photos
 
@@ -45,6 +46,13 @@ class DeepShadow:
         return load_deepshadow(folder)
 
 
+class _Parameters(Struct):
+    focal_length: Positive
+    cam_location_x: Number
+    cam_location_y: Number
+    cam_location_z: Number
+
+
 def load_deepshadow(folder: Path) -> KnownScene:
     """Load camera, lights and picture files of a DeepShadow scene, world frame (z up), scene units.
 
@@ -64,9 +72,9 @@ def load_deepshadow(folder: Path) -> KnownScene:
     usable = scene_photos(pictures)
     shadow, rows = tuple(usable.paths), [rows[row] for row in usable.rows]
     height, width = read_grey(shadow[0]).shape
-    given = JsonField(read_object(folder / PARAMETERS, "focal_length"), str(folder / PARAMETERS))
-    focal = given["focal_length"].number(above=0.0)
-    eye = np.array([given[f"cam_location_{axis}"].number() for axis in "xyz"])
+    given = read_scene(folder / PARAMETERS, _Parameters)
+    focal = given.focal_length
+    eye = np.array([given.cam_location_x, given.cam_location_y, given.cam_location_z])
     camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
     lights = tuple(Light(path.name, "point", position=row.position) for row, path in zip(rows, shadow, strict=True))
     nearest = min(float(np.linalg.norm(row.position - eye)) for row in rows)

@@ -16,7 +16,7 @@ from calibration.lights.photo_lists import dark_photos, folders_of, match, photo
 from calibration.scenes.distant_camera import distant_light, distant_scene, picture_camera
 from capture.decode.formats import decode
 from capture.errors import CalibrationError
-from capture.files.json_field import read_text
+from capture.files.schema import read_text
 from capture.session.scene_photos import scene_photos
 
 DIRECTIONS, INTENSITIES, NAMES, MASK = "light_directions.txt", "light_intensities.txt", "filenames.txt", "mask.png"

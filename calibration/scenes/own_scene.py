@@ -8,22 +8,33 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
+from msgspec import Struct
 
 from calibration.calibration import load_calibration, save_calibration
 from calibration.known_scene import KnownScene
 from calibration.lights.photo_lists import DARK, photos_in
 from capture.errors import CalibrationError, CaptureError
 from capture.files.atomic import atomic_folder, write_json
-from capture.files.json_field import JsonField, read_object
 from capture.files.names import inside
+from capture.files.schema import Text, read_scene
 from capture.photos.photo import read_alpha, read_grey
 from capture.session.scene_photos import scene_photos
 
 FORMAT = 1
 MARKER, CALIBRATION, PHOTOS, SHADOWS, MASK = "import.json", "calibration.json", "photos", "shadows", "mask.png"
+
+
+class _Marker(Struct):
+    format: Literal[1]
+    photos: bool
+    shadows: bool
+    ground_known: bool
+    linear: bool
+    notes: tuple[Text, ...]
 
 
 class OwnScene:
@@ -42,16 +53,14 @@ class OwnScene:
             CalibrationError, CaptureError: a file or entry is missing or impossible; the message names both.
         """
         source = folder / MARKER
-        document = JsonField(read_object(source, "format"), str(source))
-        if document["format"].value != FORMAT:
-            raise document["format"].refuse(f"{FORMAT} was")
+        given = read_scene(source, _Marker)
         calibration = load_calibration((folder / CALIBRATION).resolve())  # links in a capture are followed
         names = list(dict.fromkeys(light.photo for light in calibration.lights))
         rgb, shadows = (
             tuple(inside(folder, f"{place}/{name}", f"{folder / CALIBRATION}: 'photo'") for name in names)
-            if document[place].flag()
+            if is_there
             else None
-            for place in (PHOTOS, SHADOWS)
+            for place, is_there in ((PHOTOS, given.photos), (SHADOWS, given.shadows))
         )
         if rgb is None and shadows is None:
             raise CalibrationError(f"{source}: neither '{PHOTOS}' nor '{SHADOWS}' is true; one of them was needed.")
@@ -64,10 +73,10 @@ class OwnScene:
             shadows and tuple(shadows[row] for row in usable.rows),
             mask if mask.is_file() else None,
             mask_is_grey=True,
-            ground_known=document["ground_known"].flag(),
-            is_linear=document["linear"].flag(),
+            ground_known=given.ground_known,
+            is_linear=given.linear,
             dark_paths=tuple(photos_in(folder / DARK)),
-            notes=tuple(note.text() for note in document["notes"].entries()),
+            notes=given.notes,
             photos_left_out=usable.left_out,
             every_photo=tuple(names),
         )

@@ -10,16 +10,18 @@ ground is not given, and is estimated.
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Meta, Struct
 
 from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.known_scene import KnownScene
 from calibration.light import Light
 from calibration.lights.known_ground import find_ground_height, preview
-from calibration.lights.layouts import BLENDER, rigid
+from calibration.lights.layouts import lamps
 from calibration.lights.photo_lists import photos_in
 from calibration.lights.power import with_common_power
 from calibration.pose import Pose
@@ -28,7 +30,7 @@ from calibration.scenes.distant_camera import LOOKING_DOWN
 from capture.decode.formats import read_size
 from capture.errors import CalibrationError
 from capture.files.arrays import read_npy
-from capture.files.json_field import JsonField, read_object
+from capture.files.schema import EXPORT, Count, Vector, as_type, read_json
 from capture.session.scene_photos import scene_photos
 
 PARAMETERS, PHOTOS, SHADOWS, MASK = "params.json", "rgb", "visibility", "mask_obj.png"
@@ -43,6 +45,20 @@ class _Given:
     posed_camera: PosedCamera  # its ground is not known yet
     places: Float[np.ndarray, "lights 3"]
     note: str
+
+
+class _Parameters(Struct):
+    imhw: Annotated[tuple[int, int], Meta(description="height and width")]
+    K: Annotated[tuple[Vector, Vector, Vector], Meta(description="three rows of three numbers")]
+    n_light: Count = 0
+
+    def __post_init__(self) -> None:
+        self.camera()
+
+    def camera(self) -> Camera:
+        """Return the camera."""
+        (fx, _, cx), (_, fy, cy), _ = self.K
+        return Camera(self.imhw[1], self.imhw[0], fx, fy, cx - 0.5, cy - 0.5)
 
 
 class S3Nerf:
@@ -62,9 +78,14 @@ class S3Nerf:
             CalibrationError, CaptureError: a file or field is missing or impossible; the message names both.
         """
         source = folder / PARAMETERS
-        document = JsonField(read_object(source, "K"), str(source))
-        is_captured = "light_pos" not in document.value
-        given = _captured(document, folder) if is_captured else _rendered(document)
+        content = read_json(source)
+        parameters = as_type(content, _Parameters, str(source), EXPORT)
+        is_captured = "light_pos" not in content
+        if is_captured:
+            given = _captured(parameters, folder)
+        else:
+            pose, places = lamps(content, source)
+            given = _Given(PosedCamera(parameters.camera(), pose, 0.0), places, "")
         found_photos, rows = _numbered(folder / PHOTOS, len(given.places), source)
         shadows = [folder / SHADOWS / path.name for path in found_photos]
         has_shadows = all(path.is_file() for path in shadows)
@@ -113,43 +134,20 @@ def _grounded(given: _Given, photos: list[Path], is_captured: bool) -> tuple[Cal
     return Calibration.of(PosedCamera(given.posed_camera.camera, pose, ground), lights, unit="scene"), None
 
 
-def _rendered(document: JsonField) -> _Given:
-    matrix = np.array([row.numbers(4) for row in document["pose_c2w"].entries()])
-    pose = rigid(matrix @ np.diag([*np.diag(BLENDER), 1.0]), document.file, "pose_c2w")
-    places = [entry.numbers(3) for entry in document["light_pos"].entries()]
-    if not places:
-        raise document["light_pos"].refuse("one place for each photo was")
-    return _Given(PosedCamera(_camera(document), pose, 0.0), np.array(places), "")
-
-
-def _captured(document: JsonField, folder: Path) -> _Given:
+def _captured(given: _Parameters, folder: Path) -> _Given:
     """The scene of photographs: directions at an assumed distance from the point looked at; picture's world frame."""
-    camera = _camera(document)
+    camera, count = given.camera(), given.n_light
     towards = read_npy(folder / DIRECTIONS)
     towards = towards[0] if towards.ndim == 3 else towards
-    count = document["n_light"].count()
     if towards.shape != (count, 3) or not np.isfinite(towards).all():
         raise CalibrationError(
             f"{folder / DIRECTIONS} has the shape {towards.shape}, {count} x 3 finite numbers ('n_light' of "
-            f"{document.file}) were needed."
+            f"{folder / PARAMETERS}) were needed."
         )
     away = CAMERA_DISTANCE * camera.fx / camera.height
     pose = Pose(LOOKING_DOWN, np.array([0.0, 0.0, away]))
     note = f"lights: directions only; they and the camera were assumed {away:.3g} units away, the layout's default"
     return _Given(PosedCamera(camera, pose, 0.0), away * towards, note)
-
-
-def _camera(document: JsonField) -> Camera:
-    size = document["imhw"].entries()
-    if len(size) != 2:
-        raise document["imhw"].refuse("height and width were")
-    height, width = (entry.count() for entry in size)
-    rows = document["K"].entries()
-    if len(rows) != 3:
-        raise document["K"].refuse("three rows were")
-    k = [[row.entries()[c] for c in range(3)] if len(row.numbers(3)) == 3 else [] for row in rows]
-    fx, fy = k[0][0].number(above=0.0), k[1][1].number(above=0.0)
-    return Camera(width, height, fx, fy, k[0][2].number() - 0.5, k[1][2].number() - 0.5)
 
 
 def _numbered(folder: Path, n_rows: int, source: Path) -> tuple[list[Path], list[int]]:

@@ -1,30 +1,40 @@
 """Scenes that come with their camera, ground and lights: the layout of ShadowNeuS, NeRF-synthetic plus light poses."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Meta, Struct
 
 from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.known_scene import KnownScene
 from calibration.light import Light
 from calibration.lights.known_ground import shading_misfit
+from calibration.lights.layouts import FROM_BLENDER, Floor, Frame, Frames
 from calibration.lights.power import with_common_power
 from calibration.pose import Pose
 from calibration.scenes.ground_depth import find_ground_depth
 from capture.errors import CalibrationError
-from capture.files.json_field import read_object
 from capture.files.names import inside
+from capture.files.schema import read_scene
 from capture.photos.photo import read_photo, read_stack
 from capture.session.scene_photos import scene_photos
 
-OPENCV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])  # Blender: x right, y up, looking along -z
 PREVIEW_LONG_SIDE = 128  # px: enough for one number per scene (kind of light, power)
 SAME_CAMERA_TOLERANCE = 1e-4  # scene units or unit vectors: exporters round to six digits
 SHADOW_PICTURE_SHARE = 0.98  # of the pixels are black or white in a picture of shadows
+
+
+class _Kind(Struct):
+    light_type: Literal["point", "directional"] | None = None
+
+
+class _Description(Frames):
+    camera_angle_x: Annotated[float, Meta(gt=0, lt=np.pi, description="radians between 0 and pi")]
 
 
 class ShadowNeus:
@@ -59,10 +69,8 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
         CalibrationError: a file or field is missing or impossible; the message names both.
     """
     source = folder / f"transforms_{split}.json"
-    description = _read_json(source)
-    frames = _field(description, "frames", list, source)
-    if not frames:
-        raise CalibrationError(f"{source}: 'frames' is empty; at least one photo is needed.")
+    description = _described(source)
+    frames = description.frames
     pictures = [_picture_path(folder, frame, i, source) for i, frame in enumerate(frames)]
     if len({p.name for p in pictures}) < len(pictures):
         raise CalibrationError(f"{source}: two frames share the file name of their 'file_path'; give each its own.")
@@ -72,21 +80,22 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
     shadow_paths = shadow_paths and [shadow_paths[row] for row in usable.rows]
     is_shadow_only = _is_shadow_picture(pictures[0]) and _is_shadow_picture(pictures[-1])
     shadow_paths = shadow_paths or (pictures if is_shadow_only else None)
-    if any(len(_suns(frame, f"{source}, frame {i}")) > 1 for i, frame in enumerate(frames)):
+    if any(len(frame.transform_matrix_sun) > 1 for frame in frames):
         if is_shadow_only:
             raise CalibrationError(f"{source}: shadow pictures of several lights at once; one light each is needed.")
         shadow_paths = None  # they do not show which of the lights is hidden
     stack = read_stack(pictures, PREVIEW_LONG_SIDE)
-    camera = _camera(description, source, stack.full_width, stack.full_height)
+    camera = _camera(description.camera_angle_x, stack.full_width, stack.full_height)
     world_from_camera = _fixed_camera(frames, source)
-    height = _ground_height(folder / "transforms_floor.json")
+    height = read_scene(folder / "transforms_floor.json", Floor).frames[0].transform_ground[2][3]
     if world_from_camera.translation[2] <= height:
         raise CalibrationError(f"{source}: the camera is below the ground (z = {height:g}); one above it was needed.")
     candidates = {
         kind: tuple(light for light in _lights(frames, every, kind, height, source) if light.photo in kept)
         for kind in ("point", "directional")
     }
-    kind = _stated_kind(folder, description, source)
+    scene = folder / "scene.json"
+    kind = description.light_type or (read_scene(scene, _Kind).light_type if scene.is_file() else None)
     calibration = Calibration(camera, world_from_camera, height, candidates[kind or "point"], unit="scene")
     if not is_shadow_only:
         options = [replace(calibration, lights=candidates[k]) for k in ([kind] if kind else candidates)]
@@ -103,34 +112,15 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
     )
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        others = sorted(p.name for p in path.parent.glob("transforms_*.json"))
-        raise CalibrationError(f"{path} does not exist; the folder has {', '.join(others) or 'no transforms_*.json'}.")
-    return read_object(path, "frames")
+def _described(source: Path) -> _Description:
+    if not source.is_file():
+        others = ", ".join(sorted(p.name for p in source.parent.glob("transforms_*.json"))) or "no transforms_*.json"
+        raise CalibrationError(f"{source} does not exist; the folder has {others}.")
+    return read_scene(source, _Description)
 
 
-def _field(holder: Any, name: str, kind: type | tuple[type, ...], where: object) -> Any:
-    value = holder.get(name) if isinstance(holder, dict) else None
-    if not isinstance(value, kind) or isinstance(value, bool):
-        found = "missing" if value is None else f"a {type(value).__name__}"
-        raise CalibrationError(f"{where}: '{name}' is {found}; it is needed. Compare the file with the layout in docs.")
-    return value
-
-
-def _matrix(frame: Any, name: str, where: object) -> Float[np.ndarray, "4 4"]:
-    rows = _field(frame, name, list, where)
-    try:
-        matrix = np.array(rows, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.zeros(0)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise CalibrationError(f"{where}: '{name}' is not a 4 x 4 matrix of finite numbers.")
-    return matrix
-
-
-def _picture_path(folder: Path, frame: Any, index: int, source: Path) -> Path:
-    name = _field(frame, "file_path", str, f"{source}, frame {index}")
+def _picture_path(folder: Path, frame: Frame, index: int, source: Path) -> Path:
+    name = frame.file_path
     return inside(folder, name if name.endswith(".png") else name + ".png", f"{source}, frame {index}: 'file_path'")
 
 
@@ -152,37 +142,29 @@ def _is_shadow_picture(path: Path) -> bool:
     return bool(two_valued and np.allclose(rgb, grey[..., None], atol=0.005))
 
 
-def _camera(description: dict[str, Any], source: Path, width: int, height: int) -> Camera:
-    angle = _field(description, "camera_angle_x", (int, float), source)
-    if not 0 < angle < np.pi:
-        raise CalibrationError(f"{source}: 'camera_angle_x' is {angle!r:.20}; radians between 0 and pi are needed.")
+def _camera(angle: float, width: int, height: int) -> Camera:
     focal = width / 2 / np.tan(angle / 2)
     return Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
 
 
-def _fixed_camera(frames: list[Any], source: Path) -> Pose:
-    matrices = [_matrix(f, "transform_matrix", f"{source}, frame {i}") for i, f in enumerate(frames)]
+def _fixed_camera(frames: Sequence[Frame], source: Path) -> Pose:
+    matrices = [np.array(frame.transform_matrix) for frame in frames]
     moved = [i for i, m in enumerate(matrices) if not np.allclose(m, matrices[0], atol=SAME_CAMERA_TOLERANCE)]
     if moved:
         raise CalibrationError(
             f"{source}: 'transform_matrix' of frame {moved[0]} differs from frame 0; all photos must share one camera."
         )
     try:
-        return Pose.from_matrix(matrices[0] @ OPENCV_FROM_BLENDER)
+        return Pose.from_matrix(matrices[0] @ FROM_BLENDER)
     except ValueError as error:
         raise CalibrationError(f"{source}, frame 0: 'transform_matrix' is no rotation and translation.") from error
 
 
-def _ground_height(path: Path) -> float:
-    frames = _field(_read_json(path), "frames", list, path)
-    return float(_matrix(frames[0] if frames else None, "transform_ground", f"{path}, frame 0")[2, 3])
-
-
-def _lights(frames: list[Any], pictures: list[Path], kind: str, height: float, source: Path) -> tuple[Light, ...]:
+def _lights(frames: Sequence[Frame], pictures: list[Path], kind: str, height: float, source: Path) -> tuple[Light, ...]:
     lights = []
     for i, (frame, path) in enumerate(zip(frames, pictures, strict=True)):
         where = f"{source}, frame {i}"
-        lights += [_light(matrix, path.name, kind, height, where) for matrix in _suns(frame, where)]
+        lights += [_light(matrix, path.name, kind, height, where) for matrix in np.array(frame.transform_matrix_sun)]
     return tuple(lights)
 
 
@@ -193,24 +175,3 @@ def _light(matrix: Float[np.ndarray, "4 4"], photo: str, kind: str, height: floa
     if kind == "point":
         return Light(photo, kind, position=place)
     return Light(photo, kind, direction=towards / max(float(np.linalg.norm(towards)), 1e-12))
-
-
-def _suns(frame: Any, where: str) -> list[Float[np.ndarray, "4 4"]]:
-    """Return the light of a photo, or all of them if 'transform_matrix_sun' is a list of matrices."""
-    given = _field(frame, "transform_matrix_sun", list, where)
-    is_list = bool(given) and isinstance(given[0], list) and bool(given[0]) and isinstance(given[0][0], list)
-    each = given if is_list else [given]
-    return [_matrix({"transform_matrix_sun": one}, "transform_matrix_sun", where) for one in each]
-
-
-def _stated_kind(folder: Path, description: dict[str, Any], source: Path) -> str | None:
-    path = folder / "scene.json"
-    stated = [(source, description.get("light_type"))]
-    if path.is_file():
-        stated.append((path, _read_json(path).get("light_type")))
-    for where, kind in stated:
-        if kind in ("point", "directional"):
-            return str(kind)
-        if kind is not None:
-            raise CalibrationError(f"{where}: 'light_type' is {kind!r}; 'point' or 'directional' is needed.")
-    return None

@@ -20,6 +20,7 @@ MOST_ENTRIES = 100_000  # of a list or an object
 LARGEST_NUMBER = 1e15  # beyond, float64 holds no halves, and products of a few numbers soon overflow
 LONGEST_SHOWN = 80  # letters of a wrong value in a sentence
 CORRECT = "Calibrate again, or correct the file."
+EXPORT = "Correct the file, or export the scene again."
 
 Number = Annotated[float, Meta(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]  # finite: comparisons refuse NaN
 NotNegative = Annotated[float, Meta(ge=0, le=LARGEST_NUMBER)]
@@ -30,6 +31,9 @@ FileName = Annotated[
     str, Meta(pattern=r"\A(?!\.{1,2}\Z)[^/\0]+\Z", max_length=LONGEST_NAME, description="the name of a file")
 ]
 Vector = tuple[Number, Number, Number]
+Power = tuple[NotNegative, NotNegative, NotNegative]
+Row = tuple[Number, Number, Number, Number]
+Matrix = Annotated[tuple[Row, Row, Row, Row], Meta(description="4 rows of 4 numbers")]
 Kind = TypeVar("Kind")
 
 _WORDS = {"float": "a number", "int": "a whole number", "str": "a text", "bool": "true or false", "null": "nothing"} | {
@@ -59,6 +63,16 @@ def as_type(
         place = re.sub(r"^\$\.?", "", place.removeprefix("key` in `").removesuffix("`"))
         own = wrong.__cause__ is not None
         raise error(f"{file}: {_fault(said, own, place, value, kind)}. {advice}".rstrip()) from None
+
+
+def refused(name: str, value: Any, needed: str) -> ValueError:
+    """Return the error with which a Struct's __post_init__ refuses one of its fields."""
+    return ValueError(f".{name} is {_shown(value)}; needed: {needed}")
+
+
+def _shown(value: Any) -> str:
+    shown = repr(value)
+    return shown if len(shown) <= LONGEST_SHOWN else shown[: LONGEST_SHOWN - 3] + "..."
 
 
 def check_numbers(value: Any, file: str, advice: str = CORRECT, name: str = "") -> None:
@@ -101,10 +115,48 @@ def read_as(path: Path, kind: type[Kind], advice: str = CORRECT) -> tuple[Kind, 
     return as_type(value, kind, str(path), advice), value
 
 
+def read_text(path: Path) -> str:
+    """Read a text file, without its byte-order mark; bytes that are not UTF-8 become replacement characters.
+
+    Raises:
+        CalibrationError: the file cannot be read, or is larger than LARGEST_FILE.
+    """
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise CalibrationError(
+                f"{path} is larger than {LARGEST_FILE >> 20} MB; a description of a scene is smaller."
+            )
+        return path.read_text("utf-8-sig", errors="replace")
+    except OSError as error:
+        raise CalibrationError(f"{path} cannot be read ({error.strerror}). Check the file and its name.") from error
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file of limited size and depth, of a capture or of another program's scene.
+
+    Raises:
+        CalibrationError: the file cannot be read, is larger than LARGEST_FILE, is not JSON, or is nested too deeply.
+    """
+    text = read_text(path)
+    try:
+        return parse_json(text)
+    except ValueError as error:  # no JSON, or digits and brackets without end
+        raise CalibrationError(f"{path} is not JSON ({why(error)}); export the scene again.") from error
+
+
+def read_scene(path: Path, kind: type[Kind]) -> Kind:
+    """Read a JSON file of a capture or of another program's scene as a type.
+
+    Raises:
+        CalibrationError: as read_json, or a value is of another type; names it.
+    """
+    return as_type(read_json(path), kind, str(path), EXPORT)
+
+
 def _fault(said: str, own: bool, place: str, value: Any, kind: Any) -> str:
     """Return what is wrong in the words of a person."""
     if own:  # of a __post_init__
-        return f"{place}: {said}" if place else said
+        return f"{place}{said}".lstrip(".") if said.startswith(".") else ": ".join(filter(None, (place, said)))
     steps = re.findall(r"[^.\[\]]+|\.\.\.", place)
     nodes, needed = _at(kind, steps)
     named = re.search(r"(missing required|unknown) field `(.*)`", said)
@@ -118,9 +170,7 @@ def _fault(said: str, own: bool, place: str, value: Any, kind: Any) -> str:
             place, needed = place.partition("[...]")[0], needed or f"{_worded(said)} in each entry"
             break
         value = value[int(step)] if isinstance(value, list | tuple) else value[step]
-    shown = repr(value)
-    shown = shown if len(shown) <= LONGEST_SHOWN else shown[: LONGEST_SHOWN - 3] + "..."
-    return f"{place or 'the file'} is {shown}; needed: {needed or _worded(said)}"
+    return f"{place or 'the file'} is {_shown(value)}; needed: {needed or _worded(said)}"
 
 
 def _worded(said: str) -> str:

@@ -3,22 +3,24 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Float16, Int16, UInt8
+from msgspec import Struct
 from torch import Tensor
 
-from calibration.calibration import camera_of, is_rigid
+from calibration.calibration import is_rigid
+from calibration.camera import Camera
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError, ReconstructionError
 from capture.files.atomic import atomic_file
-from capture.files.json_field import JsonField
 from capture.files.regular import why
+from capture.files.schema import as_type
 from capture.session.capture import MOST_VIEWS
 from reconstruct.detail.surface import Window
 from reconstruct.fields import BRIGHTEST, MOST_NUMBERS, Fields
@@ -115,6 +117,11 @@ def _number(view: int) -> str:
     return f"_{view}" if view else ""
 
 
+class _Header(Struct):
+    camera: Camera
+    window: Window
+
+
 def load_details(path: Path, fields: Fields) -> tuple[Detail, ...]:
     """Read the details of a surface from a file, which may be a stranger's; none if there are none for this surface.
 
@@ -134,8 +141,8 @@ def load_details(path: Path, fields: Fields) -> tuple[Detail, ...]:
             own = {name: stored.tensors.get(name + _number(view)) for name in OF_A_VIEW}
             tensors = {name: tensor for name, tensor in own.items() if tensor is not None}
             if tensors:
-                rest = JsonField(parsed(stored.header, f"detail{_number(view)}"), str(path), "the header", MAKE)
-                found.append(_checked(tensors, rest, fields, view))
+                rest = parsed(stored.header, f"detail{_number(view)}")
+                found.append(_checked(tensors, as_type(rest, _Header, f"{path}: the header", MAKE), fields, view))
     except CalibrationError as error:
         raise ReconstructionError(str(error)) from error
     except (OSError, ValueError) as error:
@@ -145,7 +152,7 @@ def load_details(path: Path, fields: Fields) -> tuple[Detail, ...]:
     return tuple(found)
 
 
-def _checked(tensors: Mapping[str, Tensor], rest: JsonField, fields: Fields, view: int) -> Detail:
+def _checked(tensors: Mapping[str, Tensor], rest: _Header, fields: Fields, view: int) -> Detail:
     """Return one view's detail in a file.
 
     Raises:
@@ -157,14 +164,9 @@ def _checked(tensors: Mapping[str, Tensor], rest: JsonField, fields: Fields, vie
     missing = OF_A_VIEW.keys() - tensors.keys()
     if missing:
         raise ValueError(f"view {view + 1} lacks {', '.join(sorted(missing))}")
-    camera = camera_of(rest["camera"], rest["camera"].get("fisheye", False).flag())
-    place = rest["window"]
-    window = Window(
-        place["left"].count(0, LARGEST_SIDE),
-        place["top"].count(0, LARGEST_SIDE),
-        place["width"].count(2, LARGEST_SIDE),
-        place["height"].count(2, LARGEST_SIDE),
-    )
+    camera, window = rest.camera, rest.window
+    if min(window.left, window.top, window.width - 2, window.height - 2) < 0 or max(astuple(window)) > LARGEST_SIDE:
+        raise ValueError(f"{window} was found, 2 pixels each way or more inside a photo were needed")
     size = (window.height, window.width)
     found = [tuple(tensors[name].shape[:2]) for name in ("normals", "albedo", "confidence")]
     if {*found, (camera.height, camera.width)} != {size}:

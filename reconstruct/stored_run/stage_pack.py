@@ -12,13 +12,14 @@ import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta, Struct
 
 from capture.errors import CaptureError
 from capture.files.atomic import parse_json
-from capture.files.json_field import JsonField
 from capture.files.regular import open_regular, read_regular
-from capture.files.schema import check_numbers
+from capture.files.schema import MOST_ENTRIES, Count, Text, as_type, check_numbers
 
 STAGE_PACK, FACTS = "stage.zip", "facts.json"
 FORMAT = 5
@@ -30,6 +31,17 @@ END = 1 << 16  # bytes at each end of a file that its mark is made of
 PART = re.compile(r"[a-z0-9-]{1,40}\.(bin|jpg)")
 UTF_8 = 0x800  # flag of a name; encryption, patches and sizes that come later have others
 ZIP_TIME = (1980, 1, 1, 0, 0, 0)  # the same run gives the same bytes
+
+
+class _Part(Struct):
+    count: Annotated[int, Meta(ge=0, le=MOST_NUMBERS)]
+    offset: Count
+
+
+class _Facts(Struct):
+    format: Literal[5]
+    parts: Annotated[dict[Text, _Part], Meta(max_length=MOST_ENTRIES)]
+    size: Text
 
 
 class StagePack:
@@ -54,15 +66,9 @@ class StagePack:
             raise ValueError("too many facts")
         if (damaged := self._archive.testzip()) is not None:
             raise ValueError(f"{damaged} is damaged")
-        document = JsonField(parse_json(self._archive.read(FACTS).decode()), STAGE_PACK, "", "Remove it.")
-        if document["format"].value != FORMAT:
-            raise ValueError("another format")
-        for part in document["parts"].items().values():
-            part["count"].count(least=0, most=MOST_NUMBERS)
-            part["offset"].count(least=0)
-        document["size"].text()
-        check_numbers(document.value, STAGE_PACK)
-        self.facts: dict[str, Any] = document.value
+        self.facts: dict[str, Any] = parse_json(self._archive.read(FACTS).decode())
+        check_numbers(self.facts, STAGE_PACK)
+        as_type(self.facts, _Facts, STAGE_PACK, "Remove it.")
         self.names = tuple(name for name in entries if name != FACTS)
         addressed(self.facts, {name: name for name in self.names})
 
