@@ -1,5 +1,6 @@
 """A kill, a fault or a damaged file at any moment leaves a checkpoint that loads, and the same surface in the end."""
 
+import os
 import resource
 import subprocess
 import sys
@@ -126,6 +127,30 @@ def test_a_kill_at_every_step_of_writing_a_checkpoint_leaves_one_that_loads(tmp_
     )
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) >= 16  # eight steps, before and after each
+
+
+@pytest.mark.parametrize("name", ["fsync", "replace"])
+def test_a_fault_while_writing_a_checkpoint_leaves_the_earlier_ones_and_no_half_file(tmp_path, monkeypatch, name):
+    path = tmp_path / "checkpoint.safetensors"
+    store(path, 1.0)
+    store(path, 2.0)
+    real = getattr(os, name)
+    for fails_at in range(1, 4):
+        calls = []
+
+        def failing(*arguments, calls=calls, fails_at=fails_at):
+            calls.append(arguments)
+            if len(calls) == fails_at:
+                raise OSError(5, "Input/output error")
+            return real(*arguments)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(atomic.os, name, failing)
+            try:
+                store(path, 3.0)
+            except OSError:
+                assert not [p.name for p in tmp_path.iterdir() if atomic.TEMPORARY in p.name]
+        assert stored(path) in (2.0, 3.0)
 
 
 def test_the_last_two_checkpoints_are_kept_and_a_damaged_one_is_passed_over_with_a_sentence(tmp_path):
