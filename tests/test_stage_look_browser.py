@@ -27,7 +27,7 @@ from viewer.stage.page import stage_page
 pytestmark = pytest.mark.browser
 
 SMALL = {"width": 320, "height": 240}
-SIZES = [(1600, 1000), (1000, 640), (390, 844)]
+SIZES = [(1600, 1000), (390, 844)]
 VIEW = {"azimuth": -1.2, "elevation": 0.5, "distance": 420.0, "focal": FOCAL_HEIGHTS, "shift": [0, 0]}
 BEHIND = {"azimuth": VIEW["azimuth"] + np.pi - 0.3, "elevation": 0.7, "distance": 600.0, "strength": 0.7}  # the object
 SOFT = {"azimuth": VIEW["azimuth"] + 1.2, "elevation": 0.7, "distance": 600.0, "radius": 90.0, "strength": 0.7}
