@@ -59,6 +59,15 @@ def test_rays_tell_the_rim_from_the_lid(seen, smeared):
     assert (belief[~truth.mask] == 0.5).all()  # no ray tells
 
 
+def test_every_second_pixel_tells_the_same(seen, smeared):
+    scene, truth, _, hull, labels, *_ = seen
+    behind, there, alike = smeared
+    part = (slice(None, None, 2), slice(None, None, 2))
+    belief = matter_of_hull(hull, scene, labels, behind[part], 2, alike[part])
+    right = (belief > 0.5) == there[part]
+    assert right[truth.mask[part]].mean() > 0.85
+
+
 def test_the_integral_is_held_where_matter_is_and_breaks_beside_it(seen, smeared):
     scene, truth, lidded, _, _, lid, true = seen
     behind, there, _ = smeared

@@ -134,6 +134,18 @@ def test_sixteen_bit_files_keep_their_depth(tmp_path):
         assert photo.rgb == pytest.approx(decode_srgb(values), abs=1e-7)
 
 
+def test_a_float_tiff_is_linear_already(tmp_path):
+    values = np.full((8, 9, 3), 0.25, np.float32)
+    values[2, 3] = 1.0
+    cv2.imwrite(str(tmp_path / "linear.tif"), values)
+    photo = read_photo(tmp_path / "linear.tif")
+    assert read_size(tmp_path / "linear.tif") == (9, 8)
+    assert photo.is_linear and photo.rgb[0, 0, 0] == 0.25
+    around = np.zeros((8, 9), bool)
+    around[1:4, 2:5] = True  # demosaicking has mixed the saturated sample with its neighbours
+    assert (photo.clipped == around).all()
+
+
 def test_a_sample_at_the_top_of_the_scale_is_clipped_and_one_just_below_is_not(tmp_path):
     pixels = np.full((4, 4, 3), 100, np.uint8)
     pixels[0, 0, 1], pixels[0, 1, 2], pixels[0, 2, 0] = 255, 254, 250
