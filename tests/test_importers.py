@@ -21,6 +21,7 @@ from dataset_folders import (
 from PIL import Image
 from synthetic import BALL, HEAP, Box, Look, Sphere, render
 
+import calibration.scenes
 import shadowgraph
 from calibration.calibration import save_calibration
 from calibration.scenes.distant_camera import picture_camera
@@ -407,8 +408,24 @@ def test_the_focal_length_of_exif_is_the_cameras_unless_the_picture_was_cropped(
     assert cropped.camera.fx == 1000 and "assumed" in said
 
 
+@pytest.mark.parametrize("name", ["suns", "lamps_of_a_dome", "a_scanner"])
+def test_a_layout_of_another_program_is_one_module(name, tmp_path, monkeypatch):
+    (tmp_path / "modules").mkdir()
+    (tmp_path / "modules" / f"layout_of_{name}.py").write_text(
+        f"class Layout:\n    layout = 'a layout of {name}'\n    def recognises(self, folder):\n"
+        f"        return '{name}.xyz' if (folder / '{name}.xyz').exists() else None\n"
+        "    def load(self, folder, split):\n        raise NotImplementedError\nIMPORTER = Layout()\n"
+    )
+    monkeypatch.setattr(calibration.scenes, "__path__", [*calibration.scenes.__path__, str(tmp_path / "modules")])
+    with pytest.raises(CaptureError, match=f"none of the layouts .*a layout of {name}"):
+        import_folder(tmp_path, "train", tmp_path / "ours")
+    (tmp_path / f"{name}.xyz").touch()
+    found = find_importer(tmp_path)
+    assert found is not None and found.layout == f"a layout of {name}"
+
+
 def test_a_folder_of_no_layout_is_told_which_there_are(tmp_path):
-    with pytest.raises(CaptureError, match=r"none of the layouts .*S3-NeRF.*RTI"):
+    with pytest.raises(CaptureError, match=r"none of the layouts .*RTI.*S3-NeRF"):
         import_folder(tmp_path, "train", tmp_path / "ours")
     assert not (tmp_path / "ours").exists()
 

@@ -46,6 +46,9 @@ class DeepShadow:
         return load_deepshadow(folder)
 
 
+IMPORTER = DeepShadow()
+
+
 class _Parameters(Struct):
     focal_length: Positive
     cam_location_x: Number

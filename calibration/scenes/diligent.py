@@ -71,6 +71,9 @@ class Diligent:
         )
 
 
+IMPORTER = Diligent()
+
+
 def _photos(folder: Path, n_lights: int) -> tuple[list[Path], str]:
     """Return the photo of each light, in the folder or one in it."""
     if not (folder / NAMES).is_file():

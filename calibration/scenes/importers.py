@@ -1,35 +1,29 @@
 """Choose the importer for a folder: one of the layouts of other programs, or a capture of our own."""
 
+import importlib
+import pkgutil
 from dataclasses import replace
 from pathlib import Path
 
 from calibration.known_scene import Importer, KnownScene
-from calibration.scenes.deepshadow import DeepShadow
-from calibration.scenes.diligent import Diligent
 from calibration.scenes.listed_lights import ListedLights
-from calibration.scenes.own_scene import OwnScene, save_scene
-from calibration.scenes.rti import Rti
-from calibration.scenes.s3nerf import S3Nerf
-from calibration.scenes.shadowneus import ShadowNeus
-from calibration.scenes.shadowneus_real import ShadowNeusReal
+from calibration.scenes.own_scene import save_scene
 from capture.errors import CaptureError
 from capture.files.names import refuse_no_folder
 from capture.photos.finding import grouped
 from capture.session.session import load_settings
 
-IMPORTERS: tuple[Importer, ...] = (
-    OwnScene(),
-    ShadowNeus(),
-    ShadowNeusReal(),
-    DeepShadow(),
-    S3Nerf(),
-    Diligent(),
-    Rti(),
-    ListedLights(),
-)
 LISTS = (".lp", ".txt", ".csv", ".json", ".dome")  # of lights, without a camera
 BOARD, SETTINGS = "board", "session.toml"
 OF_A_CAPTURE = (SETTINGS, BOARD)  # what a capture of ours has and no other layout; lists of lights may lie by it
+
+
+def importers() -> list[Importer]:
+    """Return the importers of other programs' layouts: IMPORTER of every module of this package that has one."""
+    package = importlib.import_module(__name__.rpartition(".")[0])
+    modules = (importlib.import_module(f"{package.__name__}.{m.name}") for m in pkgutil.iter_modules(package.__path__))
+    found = (getattr(module, "IMPORTER", None) for module in modules)
+    return [importer for importer in found if importer is not None]
 
 
 def find_importer(folder: Path, lights: Path | None = None) -> Importer | None:
@@ -47,7 +41,8 @@ def find_importer(folder: Path, lights: Path | None = None) -> Importer | None:
         return None
     named = _name_in(folder, lights)
     by_list = ListedLights(lights if lights is not None and lights.is_file() else None)
-    every = (by_list,) if is_a_capture else (*IMPORTERS[:-1], by_list)
+    others = () if is_a_capture else (one for one in importers() if not isinstance(one, ListedLights))
+    every = (*others, by_list)
     found = [(importer, importer.recognises(folder)) for importer in every]
     reasons = [(i, why) for i, why in found if why is not None]
     reasons = [(i, why) for i, why in reasons if isinstance(i, ListedLights) or not (named and why.startswith(named))]
@@ -88,7 +83,7 @@ def import_folder(folder: Path, split: str, out: Path) -> tuple[Importer, KnownS
     refuse_no_folder(folder, "the folder of a scene")
     importer = find_importer(folder)
     if importer is None:
-        layouts = ", ".join(one.layout for one in IMPORTERS)
+        layouts = ", ".join(one.layout for one in importers())
         raise CaptureError(
             f"{folder} has none of the layouts that can be imported ({layouts}). A capture of your own needs no "
             "import: `shadowgraph run` reads it."

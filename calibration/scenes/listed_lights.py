@@ -67,6 +67,9 @@ class ListedLights:
         return [self.given] if self.given else [path for kind in KINDS for path in sorted(folder.glob(kind))]
 
 
+IMPORTER = ListedLights()
+
+
 def why_unused(folder: Path) -> str:
     """Return why the file of lights that lies beside photos gives no light to each; "" where none lies there."""
     for source in ListedLights().lists(folder):

@@ -82,6 +82,9 @@ class OwnScene:
         )
 
 
+IMPORTER = OwnScene()
+
+
 def save_scene(scene: KnownScene, layout: str, out: Path) -> None:
     """Write a scene in this layout, whole or not at all.
 

@@ -41,6 +41,9 @@ class Rti:
         return load_listed(folder, lists[0])
 
 
+IMPORTER = Rti()
+
+
 def _lists(folder: Path) -> list[Path]:
     """The .lp files in the folder, else those in the folders in it."""
     for places in ([folder], folders_of(folder)[1:]):

@@ -114,6 +114,9 @@ class S3Nerf:
         )
 
 
+IMPORTER = S3Nerf()
+
+
 def _grounded(given: _Given, photos: list[Path], is_captured: bool) -> tuple[Calibration, str | None]:
     """Return the scene on the ground estimated from shading, with a sentence; without one, in the picture's frame."""
     names = [path.name for path in photos]

@@ -52,6 +52,9 @@ class ShadowNeus:
         return load_known_scene(folder, split)
 
 
+IMPORTER = ShadowNeus()
+
+
 def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
     """Load camera, ground, lights and picture files of a scene in the ShadowNeuS layout, world frame, scene units.
 

@@ -88,6 +88,9 @@ class ShadowNeusReal:
         )
 
 
+IMPORTER = ShadowNeusReal()
+
+
 def _camera(intrinsics: np.ndarray, size: tuple[int, int], source: Path) -> Camera:
     is_matrix = intrinsics.shape in ((3, 3), (4, 4)) and np.isfinite(intrinsics).all()
     if not is_matrix or min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
