@@ -1,7 +1,9 @@
 """The commands `run`, `calibrate`, `reconstruct` and `check`: stages of a run, in the terminal."""
 
+import gc
 import os
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import fields
 from pathlib import Path
 
@@ -10,9 +12,26 @@ from rich.text import Text
 
 from capture.files.names import in_one_line
 from reconstruct.run_folder.folder import RunFolder
-from shadowgraph.loading import loading
 from shadowgraph.options import Calibrate, Check, Run, settings_of
 from shadowgraph.terminal import Display, page, print_lines
+
+
+@contextmanager
+def _loading() -> Iterator[None]:
+    """Import what a command needs in this block; the garbage collector never looks at what is there at its first end.
+
+    torch and the packages that come with it make a million objects, and the collector would go through them again and
+    again, half a CPU second until they are loaded, and at every later collection.
+    """
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if not gc.get_freeze_count():  # what a program that calls commands has made since may be garbage
+            gc.freeze()
+        if was_on:
+            gc.enable()
 
 
 def folder_name(folder: Path) -> str:
@@ -31,7 +50,7 @@ def run_stages(command: Calibrate, console: Console) -> None:
     Raises:
         UserError: the input, a setting or the machine cannot be used.
     """
-    with loading():
+    with _loading():
         from reconstruct.source.options import RunOptions
         from reconstruct.source.source import open_source
 
@@ -45,7 +64,7 @@ def run_stages(command: Calibrate, console: Console) -> None:
         with display.beating(opening := f"opening {command.capture}"):
             with console.status(Text(in_one_line(opening))):
                 source = open_source(command.capture, options)
-                with loading():
+                with _loading():
                     from reconstruct.run import pipeline  # after the refusals, which need none of what it imports
                 pipeline.refuse_device(options)
             with RunFolder(out, display, display.activity) as run:

@@ -27,7 +27,6 @@ from reconstruct.run_folder.lock import LOCK, lock_holder
 
 FORMAT = 1
 WAITING, RUNNING, FINISHED, FAILED, STOPPED = "waiting", "running", "finished", "failed", "stopped"
-STATES = (WAITING, RUNNING, FINISHED, FAILED, STOPPED)
 MOST_KEPT = 500  # jobs that are over
 STOPPED_CODES = (130, 143)  # Ctrl-C, SIGTERM: the run saved its state
 SAME_START_S = 1.0  # ids are reused: the same id with another start time is another process

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,10 @@ from capture.session.session import load_settings
 from reconstruct.run.queue import FAILED, FINISHED, RUNNING, STOPPED, WAITING, Job, Queue
 from reconstruct.run_folder.folder import LOG
 from reconstruct.stored_run.documents import CHECK, REPORT, read_check, read_manifest, read_report
-from viewer.display.run_follower import RunFollower
+from viewer.display.run_follower import RunFollower, status
 from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder
 from viewer.studio.growing import mark_of
-from viewer.studio.progress import run_progress
 from viewer.studio.words import without_folder
 
 PRESETS = ("draft", "standard", "fine", "paper")
@@ -32,6 +31,36 @@ ROLES = {
     "dark": "without light",
     "side": "from the side",
 }
+
+
+@dataclass(frozen=True)
+class _Progress:
+    """Where a run is."""
+
+    title: str  # what is done now, in plain words
+    message: str
+    share: float  # of the whole run, 0 to 1
+    elapsed_s: float
+    left_s: float | None  # until its end; None: not known yet
+    is_running: bool
+    is_finished: bool
+
+
+def _progress(follower: RunFollower, since_last_line_s: float = 0.0, started_s: float | None = None) -> _Progress:
+    """Return where the run of a folder is.
+
+    Args:
+        since_last_line_s: seconds since the log's last line was written.
+        started_s: seconds since the queue started its process, which may not have taken the folder yet and whose log
+            counts from a little later; None: the queue runs no process in it.
+    """
+    lines, is_running = follower.log(), follower.is_running() or started_s is not None
+    now = status(lines, is_running, since_last_line_s)
+    if now.is_finished:
+        return _Progress(now.title, "", 1.0, now.elapsed_s, 0.0, False, True)
+    elapsed = max(now.elapsed_s, since_last_line_s if is_running else 0.0, started_s or 0.0)
+    title, message = (now.title, now.message) if lines else ("Starting" if is_running else now.title, "")
+    return _Progress(title, message, now.fraction or 0.0, elapsed, now.eta_s, is_running, False)
 
 
 class Library:
@@ -100,7 +129,7 @@ class Library:
         changed = _time_of(path / LOG) or (job.asked if job else 0.0)
         began = job.began if job is not None and job.state == RUNNING else None
         last, clock = max(changed, began or 0.0), time.time()  # taken up again: not since its last line
-        now = run_progress(follower, max(0.0, clock - last), None if began is None else max(0.0, clock - began))
+        now = _progress(follower, max(0.0, clock - last), None if began is None else max(0.0, clock - began))
         report = self._document(path / REPORT, read_report)
         manifest = self._document(path / "manifest.json", read_manifest)
         check = self._document(path / CHECK, read_check)
