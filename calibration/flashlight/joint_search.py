@@ -1,7 +1,7 @@
 """All lights from outlines of shadows and the shading of all photos together, from rough starts.
 
 The work is bounded by the number of photos: one pass from each start, one from what is best of all of them photo by
-photo, a few short fits at other distances, and one per contrast. Photos that are at odds add none.
+photo, and one short fit per contrast. Photos that are at odds add none.
 """
 
 import logging
@@ -41,9 +41,6 @@ NO_GROUND = 1e-6  # log units: a misfit of less is that of no cell
 LOST = 1e9  # the cost of lights that no ground follows
 SCATTER = 4.0  # of the negative log posterior between joint fits from near starts: it has many small minima
 ALIKE = 80.0  # ground cells that are wrong together: within a photo 14 to 24 by their correlation, and photos err alike
-FARTHER = (0.5, 0.6, 0.72, 0.85, 1.0, 1.18, 1.4, 1.65, 2.0)  # along what outlines leave free: a hand's range
-NEAR_INFINITY = 0.05  # a light that would be moved 20 times as far stays
-TRIED = 4  # of these, under both worlds, with and without the wall: those that are fitted
 CONTRASTS = (1.1, 1.0, 0.9, 0.8, 0.7)  # of log brightness in the picture over that in the scene, that are tried
 CONTRAST_WIDTH = 0.1  # prior sigma of its logarithm about 0: phones lift whole regions that are dark
 _Found = tuple[float, FlashlightFit, float]  # cost of its outlines, fit, misfit of its shading (log units)
@@ -58,10 +55,8 @@ def searched(
     Outlines alone pull all lights too near, and one light that is too near, its beam aimed elsewhere, may agree with
     its photo. So both are fitted from the first step on, with an outline's sigma that falls to its own (graduated
     non-convexity) [Blake and Zisserman, Visual Reconstruction (1987)]. A light that is lost from one start is found
-    from another: the last pass begins with each photo's best. Fits creep along what outlines leave free, so that other
-    distances are tried by themselves. A wall that shading alone told may be a bend of the tone curve: each start, and
-    each distance, is tried with it and without. `between` of the fit holds what the others say that explain the photos
-    about as well.
+    from another: the last pass begins with each photo's best. `between` of the fit holds what the others say that
+    explain the photos about as well.
 
     Args:
         starts: positions, world.
@@ -70,18 +65,13 @@ def searched(
     """
     assert evidence.outlines is not None
     trusted = _trusted(evidence)
-    worlds = (NO_WALL, wall) if wall[2] > 0 else (NO_WALL,)
     found = []
     for number, one in enumerate(starts):
         LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", number + 1, len(starts) + 1)
-        begun = [_shaded_from(one, trusted, None, wall) for wall in worlds]
-        begun.sort(key=lambda each: each[2])
-        found.append(_pass(begun[0][1].flashlights, trusted, USUAL_MISFIT))
+        found.append(_pass(_held(one, _weighted(trusted, USUAL_MISFIT), None, wall)[0], trusted, USUAL_MISFIT))
     best = found[int(_posteriors(found, trusted).argmin())]
     LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", len(starts) + 1, len(starts) + 1)
     found.append(_pass(_best_of_each(best, found, evidence), trusted, best[2]))
-    best = found[int(_posteriors(found, trusted).argmin())]
-    found += _at_other_distances(best, trusted, worlds)
     posterior = _posteriors(found, trusted)
     best = found[int(posterior.argmin())]
     places = np.stack([one[1].flashlights.positions for one in found])
@@ -89,37 +79,6 @@ def searched(
     between = variance_about(best[1].flashlights.positions, places, weight) * evidence.outlines.trusted[:, None]
     fit = _settled(_best_of_each(best, found, evidence), evidence, best[2])[1]
     return replace(fit, between=between)
-
-
-def _at_other_distances(best: _Found, evidence: Evidence, worlds: Sequence[Wall]) -> list[_Found]:
-    """Return fits from the best one, its lights moved along what outlines leave free; those that then shade best.
-
-    Args:
-        worlds: walls with each of which they are tried.
-    """
-    state = best[1].flashlights
-    places = [farther(state.positions, evidence, times) for times in FARTHER]
-    rough = [_shaded_from(one, evidence, state, wall) for one in places for wall in worlds]
-    order = np.argsort(_posteriors(rough, evidence))[:TRIED]
-    return [_settled(rough[k][1].flashlights, evidence, best[2]) for k in order]
-
-
-def farther(
-    positions: Float[np.ndarray, "photos 3"], evidence: Evidence, times: float
-) -> Float[np.ndarray, "photos 3"]:
-    """Return the lights moved as outlines do not see it, the middle one so many times higher above the ground; world.
-
-    A perspectivity that keeps the ground's points and the eye turns one object, its shadows and its outline into
-    another's [Kriegman and Belhumeur, What shadows reveal about object structure, J. Opt. Soc. Am. A 18 (2001)].
-    """
-    terms = evidence.outlines
-    assert terms is not None
-    ground = np.array([0.0, 0.0, terms.ground])
-    above, eye = positions - ground, terms.eye - ground
-    share = (1 / times - 1) / np.median(above[:, 2])
-    across = 1 + share * above[:, 2:]
-    moved = (above + share * above[:, 2:] * eye) / np.maximum(across, NEAR_INFINITY)
-    return np.where(across > NEAR_INFINITY, moved, above) + ground
 
 
 def _best_of_each(best: _Found, found: Sequence[_Found], evidence: Evidence) -> Flashlights:
@@ -209,7 +168,8 @@ def _as_pictured(fit: FlashlightFit, evidence: Evidence) -> FlashlightFit:
     """Fit beam, aims and powers to the evidence with the places held, so that they say what the pictures show."""
     weighted = _weighted(evidence, USUAL_MISFIT)
     flashlights, weight = _held(fit.flashlights.positions, weighted, fit.flashlights)
-    return replace(_judged(flashlights, evidence, weighted, weight)[1], between=fit.between)
+    misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
+    return replace(fit, flashlights=flashlights, weight=weight, evidence=_weighted(evidence, misfit))
 
 
 def _posteriors(found: Sequence[_Found], evidence: Evidence) -> Float[np.ndarray, " found"]:
@@ -224,26 +184,13 @@ def _posteriors(found: Sequence[_Found], evidence: Evidence) -> Float[np.ndarray
 
 def _settled(start: Flashlights, evidence: Evidence, misfit: float) -> _Found:
     """Refine a state near the answer; misfit: of the shading, log units, by which its cells are weighted."""
+    terms = evidence.outlines
+    assert terms is not None
     weighted = _weighted(evidence, misfit)
     flashlights, weight = refine(start, weighted, LOOSE, _wall_held, FAR[:8] + NEAR)
-    return _judged(flashlights, evidence, weighted, weight)
-
-
-def _shaded_from(
-    places: Float[np.ndarray, "photos 3"], evidence: Evidence, like: Flashlights | None, wall: Wall
-) -> _Found:
-    """Return the state that shades the ground best with the lights held in these places; like: to begin from."""
-    weighted = _weighted(evidence, USUAL_MISFIT)
-    state, weight = _held(places, weighted, None if like is None else replace(like, wall=wall), wall)
-    return _judged(state, evidence, weighted, weight)
-
-
-def _judged(flashlights: Flashlights, evidence: Evidence, weighted: Evidence, weight: Samples) -> _Found:
-    """Return a state as a fit, with the cost of its outlines and the misfit of its shading; weight: of its samples."""
-    assert evidence.outlines is not None
     misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
     return (
-        evidence.outlines.cost(flashlights.positions) if (weight > 0).any() else LOST,
+        terms.cost(flashlights.positions) if (weight > 0).any() else LOST,
         FlashlightFit(flashlights, _weighted(evidence, misfit), weight, LOOSE, _wall_held),
         misfit,
     )
