@@ -52,7 +52,7 @@ def test_a_light_that_is_off_by_seven_degrees_is_named(about):
     lights[3, :3] = torch.from_numpy(Rotation.from_rotvec(np.radians(7) * axis).apply(place)).float()
     found = contradictions(replace(scene, lights=lights), assemble_labels(scene, None, None))
     assert found.contradicting() == [3]
-    assert scene.photo_names[3] in found.sentences()[0] and "--light-error" in found.sentences()[0]
+    assert scene.photo_names[3] in found.sentences()[0] and "a larger error of the lights" in found.sentences()[0]
 
 
 def test_a_surface_that_misses_held_out_shadows_says_so():
