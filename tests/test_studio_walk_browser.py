@@ -155,8 +155,9 @@ def test_the_keyboard_alone_starts_a_run_and_lights_turns_and_edits_a_result(bro
             ("+", "view", "distance"),
             ("2", "shown", "look"),
         ):
-            tab.keyboard.press(keys)
-            for _ in range(50):  # the frame is a process of its own: a key arrives there when it has time
+            for tick in range(600):  # the frame is a process of its own: a key arrives there when it has time
+                if tick % 50 == 0:
+                    tab.keyboard.press(keys)
                 now = stage.evaluate(STATE)
                 if now[part][name] != before[part][name] or now["view"] != before["view"]:
                     break
