@@ -12,7 +12,7 @@ from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError, CaptureError
 from reconstruct.fields import Fields
-from reconstruct.run.pipeline import without_ball
+from reconstruct.run.ball_on_ground import without_ball
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.source.calibrate_source import calibrate_source
 from reconstruct.source.options import RunOptions
