@@ -65,8 +65,9 @@ function sayProblem(text) {
 async function begin() {
   const canvas = byId("picture"), { addresses } = facts;
   usePanel(() => draw("still"));
+  window.addEventListener("resize", reframe);
+  panelMoved(reframe);
   openPanel(innerWidth >= ROOMY);
-  reframe();
   showFirst();
   await new Promise((done) => requestAnimationFrame(() => setTimeout(done)));  // it is on the screen before what follows
   openCanvas(canvas);
@@ -81,8 +82,6 @@ async function begin() {
   useHands(freeMiddle, (at) => { pointerAt = at; });
   onChange(changed);
   canvas.addEventListener("webglcontextlost", (e) => { e.preventDefault(); sayProblem("The graphics card gave up. Reload the page."); });
-  window.addEventListener("resize", reframe);
-  panelMoved(reframe);
   startRenderer(linesInSpace, () => byId("first").remove());
   drawBar();
   drawNotes(true);
