@@ -24,7 +24,7 @@ from hard_board_photos import LENSES, SIZE, HardPhoto, hard_photo  # pyright: ig
 from calibration.board.board import parse_board
 from calibration.board.board_pose import fit_ground
 from calibration.board.corners import find_board, grey_of
-from calibration.board.intrinsics import calibrate_camera
+from calibration.board.intrinsics import fit_camera
 from calibration.board.recognise import guess_board
 from calibration.camera import Camera
 from capture.errors import CalibrationError, UserError
@@ -68,7 +68,7 @@ def calibrated(lens: int) -> Camera:
     """The camera of this lens as its own easy photos give it."""
     photos = [hard_photo(seed, lens, easy=True) for seed in range(EASY_PHOTOS)]
     found = [corners for photo in photos if (corners := find_board(photo.grey, photo.board)) is not None]
-    return calibrate_camera(found, SIZE, None)
+    return fit_camera(found, SIZE, None).camera
 
 
 def outcome(seed: int, cameras: list[Camera]) -> Outcome:

@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
-from jaxtyping import Float
 from msgspec import Meta, Struct
 
 from calibration.calibration import Calibration, CalibrationFile, calibration_document
@@ -25,16 +23,6 @@ class CalibratedView:
 
     name: str  # of the view's folder; "" where there is one view
     calibration: Calibration
-
-    @property
-    def pose_covariance(self) -> Float[np.ndarray, "6 6"] | None:
-        """Covariance of the camera's turn (rad) about the world's axes and of its place (mm); None: not known.
-
-        With turn w and shift c the pose becomes exp(w) rotation, translation + c. Errors of the table's height and
-        slopes, which all views share, are not in it: residuals' camera_height_sigma_mm has them.
-        """
-        stored = self.calibration.residuals.get("pose_covariance")
-        return None if stored is None else np.array(stored, float)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,6 @@ from calibration.board.intrinsics import (
     CENTRE_SIGMA,
     K1_SIGMA,
     K2_SIGMA,
-    calibrate_camera,
     fit_camera,
 )
 from calibration.camera import Camera, project_from
@@ -47,17 +46,17 @@ def test_the_stated_sigma_of_one_oblique_photo_is_the_spread_of_its_focal_length
         cx, cy = np.array([599.5, 449.5]) + rng.normal(0, CENTRE_SIGMA * SIZE[0], 2)
         k1, k2 = rng.normal(0, [K1_SIGMA, K2_SIGMA]) / 2
         truth = Camera(*SIZE, 1150.0, 1150.0, float(cx), float(cy), (float(k1), float(k2), 0.0, 0.0, 0.0))
-        fit = calibrate_camera(views(truth, 1, rng), SIZE, FOCAL_35MM * (1 + rng.normal(0, 0.02)))
+        fit = fit_camera(views(truth, 1, rng), SIZE, FOCAL_35MM * (1 + rng.normal(0, 0.02))).camera
         pulls.append((fit.fx - 1150) / fit.sigmas["fx"])
     assert 0.5 < np.sqrt(np.mean(np.square(pulls))) < 1.4  # 40 draws know a spread to 11 %
 
 
 def test_a_wrong_corner_barely_moves_the_camera():
     detections = views(CAMERA, 3, np.random.default_rng(3))
-    clean = calibrate_camera(detections, SIZE, FOCAL_35MM)
+    clean = fit_camera(detections, SIZE, FOCAL_35MM).camera
     pixels = detections[0].pixels.copy()
     pixels[5] += [12, -9]
-    spoilt = calibrate_camera([Corners(pixels, BOARD.points(), BOARD), *detections[1:]], SIZE, FOCAL_35MM)
+    spoilt = fit_camera([Corners(pixels, BOARD.points(), BOARD), *detections[1:]], SIZE, FOCAL_35MM).camera
     assert abs(spoilt.fx - clean.fx) < clean.sigmas["fx"]
 
 
@@ -77,7 +76,7 @@ def test_right_exif_helps_a_photo_from_straight_above():
 
 def test_no_photo_of_a_board_is_refused():
     with pytest.raises(CalibrationError, match="0 photos"):
-        calibrate_camera([], SIZE, None)
+        fit_camera([], SIZE, None)
 
 
 FISHEYE = Camera(*SIZE, 420.0, 420.0, 605.0, 446.0, (0.03, -0.02, 0.005, 0.0, 0.0), fisheye=True)

@@ -76,23 +76,15 @@ TILTED = Lens("radial and tangential terms", False, (0, 1, 4, 2, 3), (*PLAIN.sig
 FISHEYE = Lens("a fisheye", True, (0, 1, 2, 3), (FISHEYE_SIGMA,) * 4)
 
 
-def calibrate_camera(detections: Sequence[Corners], size: tuple[int, int], focal_35mm: float | None) -> Camera:
-    """Estimate the camera of these photos of the board, with one sigma of fx, cx and cy (px).
+def fit_camera(
+    detections: Sequence[Corners], size: tuple[int, int], focal_35mm: float | None, keep_first: bool = True
+) -> CameraFit:
+    """Estimate the camera of photos of the board, with one sigma of fx, cx and cy (px), and what the fit leaves over.
 
     Args:
         detections: corners, one entry per photo of the same lens, zoom and focus; the tripod photo first.
         size: width and height of the photos as stored, px.
         focal_35mm: 35 mm equivalent focal length that EXIF claims; None if it does not.
-    """
-    return fit_camera(detections, size, focal_35mm).camera
-
-
-def fit_camera(
-    detections: Sequence[Corners], size: tuple[int, int], focal_35mm: float | None, keep_first: bool = True
-) -> CameraFit:
-    """Fit as calibrate_camera does; also return residuals, the photos used and notes for the user.
-
-    Args:
         keep_first: the first photo, the tripod's, is used even if it does not fit the others.
 
     Raises:
