@@ -133,7 +133,7 @@ def left_out(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[dict[str, 
 
 
 def _unmixed(
-    find: Callable[[Bool[np.ndarray, " photos"]], tuple[LightFit, list[str]]],
+    find: Callable[[Callable[[LightFit], bool], Bool[np.ndarray, " photos"]], tuple[LightFit, list[str]]],
     stack: PhotoStack,
     usable: Bool[np.ndarray, " photos"],
 ) -> tuple[LightFit, list[str], Bool[np.ndarray, " photos"], list[str]]:
@@ -144,15 +144,20 @@ def _unmixed(
     Args:
         find: finds the lights of some photos, and notes, as _lights does.
     """
-    fit, notes = find(usable)
-    mixed, spoilt = _mixture(fit, stack, usable), np.zeros_like(usable)
-    if mixed is None:
-        return fit, notes, spoilt, []
-    said = [mixed.sentence([light.photo for light in fit.lights])]
-    spoilt[usable] = mixed.spoilt()
-    if not spoilt.any() or (usable & ~spoilt).sum() < MIN_PHOTOS:
-        return fit, notes, np.zeros_like(usable), said
-    return *find(usable & ~spoilt), spoilt, said
+
+    def spoilt_by(mixed: MixedLight | None) -> Bool[np.ndarray, " photos"]:
+        spoilt = np.zeros_like(usable)
+        if mixed is not None:
+            spoilt[usable] = mixed.spoilt()
+        return spoilt if (usable & ~spoilt).sum() >= MIN_PHOTOS else np.zeros_like(usable)
+
+    fit, notes = find(lambda found: bool(spoilt_by(_mixture(found, stack, usable)).any()), usable)
+    mixed = _mixture(fit, stack, usable)
+    said = [] if mixed is None else [mixed.sentence([light.photo for light in fit.lights])]
+    spoilt = spoilt_by(mixed)
+    if spoilt.any():
+        fit, notes = find(lambda _: False, usable & ~spoilt)
+    return fit, notes, spoilt, said
 
 
 def _mixture(fit: LightFit, stack: PhotoStack, usable: Bool[np.ndarray, " photos"]) -> MixedLight | None:
@@ -168,9 +173,14 @@ def _lights(
     board: AnyBoard,
     lights: str,
     cues: MetricCues,
+    is_spoilt: Callable[[LightFit], bool],
     usable: Bool[np.ndarray, " photos"],
 ) -> tuple[LightFit, list[str]]:
-    """Return the lights, found by the requested method, and notes for the user about the choice."""
+    """Return the lights, found by the requested method, and notes for the user about the choice.
+
+    Args:
+        is_spoilt: as of locate_lights.
+    """
     if lights == "phone" and not session.light:
         raise CalibrationError(
             f"no photos by the flashlight's phone in {session.folder}, {MIN_VIEWS} needed for --lights phone. "
@@ -180,7 +190,7 @@ def _lights(
         unused = (
             [f"{session.phone_back.name} was not used: it helps only photos in light/"] if session.phone_back else []
         )
-        fit = locate_lights(stack, posed_camera, usable, cues)
+        fit = locate_lights(stack, posed_camera, usable, cues, is_spoilt)
         return fit, [fit.residuals["cue"], *unused]
     back, unread = _read_back(session, board)
     views = replace(read_views(session, board), back=back)
@@ -189,7 +199,7 @@ def _lights(
     except CalibrationError as error:
         if lights == "phone":
             raise
-        fit = locate_lights(stack, posed_camera, usable, cues)
+        fit = locate_lights(stack, posed_camera, usable, cues, is_spoilt)
         return fit, [f"{fit.residuals['cue']}, because {error}"]
     n_views = len(fit.residuals["phone_photos"])
     back_notes = [fit.residuals["phone_back"]["why"]] if "phone_back" in fit.residuals else unread

@@ -10,6 +10,7 @@ import pytest
 from flashlight_photos import POSED_CAMERA, Recipe, handheld_lights, photograph
 
 import calibration.calibrate as glue
+import calibration.flashlight.light_estimate as light_estimate
 from calibration.flashlight.fit import collect, first_guess, fit_flashlights, photo_quality
 from calibration.flashlight.light_estimate import LightFit
 from calibration.flashlight.model import free_tangent
@@ -19,7 +20,7 @@ from capture.checks.check_stack import check_stack
 from capture.session.session import Session, SessionSettings
 
 N, WIDTH = 18, 160
-ARRANGEMENTS = {"first half": range(9), "every third": range(0, 18, 3)}
+ARRANGEMENTS = {"first half": range(9), "last half": range(9, 18), "every third": range(0, 18, 3)}
 
 
 @pytest.fixture(scope="module")
@@ -55,14 +56,33 @@ def test_a_flashlight_that_changes_its_power_is_told_from_which_photo_on(lights,
     assert found.sentence(names).startswith(f"from {names[first]} on the light is {told:.2g} times as bright as ")
 
 
-@pytest.mark.parametrize("where", ["first half", "every third"])
-def test_two_flashlights_at_once_are_told_by_the_names_of_their_photos(lights, where):
+@pytest.fixture
+def calibrated(monkeypatch):
+    """Calibrate photos whose camera is known."""
+    residuals = {"board": "checkerboard:9x6:20", "notes": [], "pose_covariance": np.zeros((6, 6)).tolist()}
+    sheet = SimpleNamespace(on_sheet=lambda corners: corners)
+    monkeypatch.setattr(glue, "fit_board", lambda *_: (POSED_CAMERA, sheet, residuals))
+    return lambda stack: glue.calibrate(Session(Path("capture"), (), stack.paths, (), (), SessionSettings()), stack)
+
+
+def with_another(lights, both):
+    """Photos under one flashlight, and those of `both` under another of its power, too."""
     stack = photograph(Recipe(width=WIDTH, lights=of_power(lights, 0.5, range(N)))).stack
     other = photograph(Recipe(width=WIDTH, lights=of_power((*lights[5:], *lights[:5]), 0.5, range(N)))).stack
-    both = np.isin(np.arange(N), ARRANGEMENTS[where])
-    found = find_mixture(numbers(replace(stack, rgb=stack.rgb + other.rgb * both[:, None, None, None])))
-    assert found is not None and found.cause == "second light"
-    assert (found.spoilt() == both).mean() > 0.9
+    return replace(stack, rgb=stack.rgb + other.rgb * both[:, None, None, None])
+
+
+@pytest.mark.parametrize("where", ARRANGEMENTS)
+def test_photos_under_two_flashlights_are_told_and_left_out_before_outlines_are_looked_for(
+    lights, calibrated, monkeypatch, where
+):
+    """Outlines cost most, and hide the second light: with them the powers are held alike."""
+    both, asked = np.isin(np.arange(N), ARRANGEMENTS[where]), []
+    monkeypatch.setattr(light_estimate, "with_outlines", lambda *given: asked.append(given[3]))
+    found = calibrated(with_another(lights, both))
+    left_out = np.array(["a second light is on" in light.reason for light in found.lights])
+    assert (left_out == both).mean() > 0.9 and "a second light is on" in found.residuals["warnings"][0]
+    assert not any((usable & left_out).any() for usable in asked)
 
 
 @pytest.mark.parametrize("photos", [range(9), range(0, 18, 2), range(12)], ids=str)
@@ -79,7 +99,9 @@ def test_room_light_in_half_of_the_photos_is_named_and_the_others_are_right_also
 
 
 @pytest.mark.parametrize("cause", [None, "power", "second light"])
-def test_lights_are_looked_for_once_more_at_most_and_only_where_photos_were_left_out(lights, monkeypatch, cause):
+def test_lights_are_looked_for_once_more_at_most_and_only_where_photos_were_left_out(
+    lights, calibrated, monkeypatch, cause
+):
     """The bound on the work, counted in fits: trouble at most doubles them, also if the second fit is no better."""
     truth, asked = photograph(Recipe(width=WIDTH, lights=lights), 3), []
 
@@ -90,12 +112,9 @@ def test_lights_are_looked_for_once_more_at_most_and_only_where_photos_were_left
         return LightFit(own, (), np.zeros(3)), []
 
     mixed = None if cause is None else MixedLight(cause, np.arange(N) < 5, 2.0)
-    residuals = {"board": "checkerboard:9x6:20", "notes": [], "pose_covariance": np.zeros((6, 6)).tolist()}
-    sheet = SimpleNamespace(on_sheet=lambda corners: corners)
-    monkeypatch.setattr(glue, "fit_board", lambda *_: (POSED_CAMERA, sheet, residuals))
     monkeypatch.setattr(glue, "_lights", search)
     monkeypatch.setattr(glue, "_mixture", lambda *_: mixed)
-    found = glue.calibrate(Session(Path("capture"), (), truth.stack.paths, (), (), SessionSettings()), truth.stack)
+    found = calibrated(truth.stack)
     assert asked == ([N, N - 5] if cause == "second light" else [N])
     left = [light.photo for light in found.lights if not light.used]
     assert left == ([x.photo for x in truth.lights[:5]] if cause == "second light" else [])

@@ -1,6 +1,7 @@
 """Turn fitted flashlights into lights with power in colour, a realistic uncertainty and a verdict per photo."""
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -253,6 +254,7 @@ def locate_lights(
     posed_camera: PosedCamera,
     usable: Bool[np.ndarray, " photos"],
     cues: MetricCues = NO_CUES,
+    is_spoilt: Callable[[LightFit], bool] = lambda _: False,
 ) -> LightFit:
     """Estimate one point light per usable photo (world), with the beam and the ambient light they share.
 
@@ -266,6 +268,7 @@ def locate_lights(
         posed_camera: of the full-size photo.
         usable: photos to use; the others get no light.
         cues: what fixes the scale of lights from outlines.
+        is_spoilt: whether the lights by shading tell that photos have to go: then outlines, which cost most, wait.
 
     Raises:
         CalibrationError: fewer than 4 photos or lights, or too little bare ground in view.
@@ -284,7 +287,7 @@ def locate_lights(
     sigma, judged = (np.sqrt(one**2 + fit.between) for one in position_sigma(fit))
     found = describe(fit, names, floor, sigma, judged)
     found = replace(found, residuals=found.residuals | {"tone": tone.document(), "cue": BY_SHADING})
-    if surely_placed(found, evidence.cells.centre) >= FEWEST_USED:
+    if surely_placed(found, evidence.cells.centre) >= FEWEST_USED or is_spoilt(found):
         return found
     found = _doubted(found, fit)
     joint = with_outlines(evidence, stack, posed_camera, usable, fit.flashlights, edges, cues)
