@@ -26,7 +26,7 @@ from calibration.scenes.deepshadow import LIGHTS, PARAMETERS, PICTURES
 from capture.photos.photo import read_grey
 from reconstruct.evaluate.surface_distance import angle_deg, nmze
 from reconstruct.run.presets import preset
-from reconstruct.source.memory import keep_spread
+from reconstruct.source.photos import keep_spread
 
 SEEDS = 3
 PRINTED = {  # nMZE [tab:deepshadow_nmze], normal error, degrees [tab:deepshadow_quant]: ShadowNeuS's, DeepShadow's

@@ -33,9 +33,8 @@ from reconstruct.run.presets import preset
 from reconstruct.scene import Scene, build_scene
 from reconstruct.solve.solver import fit
 from reconstruct.source.calibrate_source import calibrate_source
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import Photos, read_photos
-from reconstruct.source.source import open_source
+from reconstruct.source.source import RunOptions, open_source
 
 SAMPLES = 20_000  # points on each surface: the F-score repeats to 0.003
 SYNTHETIC = "synthetic"

@@ -29,9 +29,8 @@ from calibration.light import Light
 from reconstruct.export.relit import NewLight, write_relit
 from reconstruct.labels.observer import Observer
 from reconstruct.run.solve_stage import prepare_scene
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
-from reconstruct.source.source import open_source
+from reconstruct.source.source import RunOptions, open_source
 from reconstruct.stored_run.stored_run import StoredRun
 
 PICTURES = Path(__file__).parent / "pictures"

@@ -16,7 +16,7 @@ wait_asleep()  # before any other package loads numpy or torch
 FACADE = {
     "run": "shadowgraph.api",
     "main": "shadowgraph.command",
-    "RunOptions": "reconstruct.source.options",
+    "RunOptions": "reconstruct.source.source",
     "open_source": "reconstruct.source.source",
     "read_photos": "reconstruct.source.photos",
     "calibrate_source": "reconstruct.source.calibrate_source",

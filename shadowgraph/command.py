@@ -2,31 +2,109 @@
 
 Exit codes: 0 done, 1 a fault of the program (of `batch`: a capture failed), 2 the input or a setting cannot be used, or
 the machine has no room for it (one sentence says why), 130 stopped with Ctrl-C, 143 ended by SIGTERM.
-docs/reliability.md says what holds after each.
+docs/reliability.md says what holds after each. The ways in which a command can fail have a sentence each here.
 """
 
 import difflib
 import json
+import os
+import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from types import FrameType, TracebackType
 from typing import Any, NamedTuple
 
 import tyro
 from rich.console import Console
 
-from capture.errors import UserError
-from capture.files.names import refuse_no_folder
+from capture.errors import FOR_STUDIO, Remedy, UserError
+from capture.files.names import in_one_line, refuse_no_folder
 from shadowgraph.batch_command import Batch, do_batch
 from shadowgraph.export_command import Export, Relight, do_export, do_relight
-from shadowgraph.faults import Terminated, say_fault, sentence_for, sigterm_as_ctrl_c
 from shadowgraph.options import Calibrate, Check, Doctor, Evaluate, Import, PrintBoard, Reconstruct, Report, Run, View
 from shadowgraph.run_command import check, folder_name, run_stages
 from shadowgraph.studio_command import Studio, Watch, do_studio, do_watch
 from shadowgraph.terminal import Display, print_lines
+from viewer.studio.words import in_page_words
 
+OPTIONS = {
+    Remedy.NAME_BOARD: "--board",
+    Remedy.BOARD_PHOTO: 'or session.toml: roles = { board = ["NAME.jpg"] }',
+    Remedy.LIGHTS_FILE: "--lights FILE.lp",
+    Remedy.GROUND: "--ground HEIGHT",
+    Remedy.COARSER: "--preset draft",
+    Remedy.OTHER_SEED: "--seed 1",
+    Remedy.START_AGAIN: "--force",
+    Remedy.OTHER_FOLDER: "--out",
+    Remedy.PACK_FAULT: "--debug shows more",
+}
 SOME_FAILED = 1  # exit code of a batch that ended with failed captures
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM arrived. It ends a command as Ctrl-C does; the last state is saved."""
+
+
+@contextmanager
+def sigterm_as_ctrl_c() -> Iterator[None]:
+    """Raise Terminated on SIGTERM while the block runs. In a thread that is not the main one it changes nothing."""
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        raise Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """Return whether memory ran out. Torch and OpenCV do not raise MemoryError then."""
+    words = ("not enough memory", "can't allocate memory", "out of memory")
+    return isinstance(error, MemoryError) or any(text in str(error).lower() for text in words)
+
+
+def say_fault(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Print where a fault of the program is and what to do: for sys.excepthook, without --debug."""
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    where = f" ({Path(trace.tb_frame.f_code.co_filename).name}, line {trace.tb_lineno})" if trace else ""
+    said = in_one_line(f"{kind.__name__}: {error}{where}")
+    fault = UserError(f"a fault of the program: {said}. Started again, it goes on from here.", Remedy.PACK_FAULT)
+    sys.stderr.write(f"shadowgraph: {sentence_for(fault)}\n")
+
+
+def _in_words(error: UserError) -> str:
+    """Return the text of an error with what to do as options, or as buttons of the studio that started this process."""
+    if os.environ.get(FOR_STUDIO) == "1":
+        return in_page_words(error)
+    return error.worded(lambda one: f"{one.value} ({OPTIONS[one]})" if one in OPTIONS else one.value)
+
+
+def sentence_for(error: Exception) -> str | None:
+    """Say in one sentence what is wrong with the input or the machine; None: it is a fault of the program."""
+    if isinstance(error, UserError):  # which may quote a stranger's file: nothing in it commands the terminal
+        return in_one_line(_in_words(error))
+    if isinstance(error, OSError):  # no room, no right to write, a drive that went away
+        return (
+            f"{error.filename or 'a file'}: {error.strerror or error}. Check that the place can be written to and has "
+            "room; started again, it goes on from here."
+        )
+    if isinstance(error, RecursionError):
+        return "a file that was read is nested without end, which none of ours is. Make the result again."
+    if _is_out_of_memory(error):
+        said = (str(error) or "nothing left").splitlines()[0]
+        found = f"the memory of this machine is used up ({said}). Started again, it goes on from here."
+        return _in_words(UserError(found, "close other programs", Remedy.COARSER))
+    return None
 
 
 def _batch(command: Batch, console: Console) -> None:

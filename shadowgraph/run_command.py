@@ -51,8 +51,7 @@ def run_stages(command: Calibrate, console: Console) -> None:
         UserError: the input, a setting or the machine cannot be used.
     """
     with _loading():
-        from reconstruct.source.options import RunOptions
-        from reconstruct.source.source import open_source
+        from reconstruct.source.source import RunOptions, open_source
 
     known = {f.name for f in fields(RunOptions)}
     options = RunOptions(**{k: v for k, v in settings_of(command).items() if k in known})
@@ -86,8 +85,7 @@ def check(command: Check, console: Console) -> None:
         UserError: the capture cannot be read, or, after the verdict is written, it is hopeless.
     """
     from capture.files.atomic import write_json
-    from reconstruct.source.options import RunOptions
-    from reconstruct.source.source import open_source
+    from reconstruct.source.source import RunOptions, open_source
 
     options, display = RunOptions(board=command.board, lights=command.lights), Display(console)
     with display.beating(f"opening {command.capture}"):

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from calibration.board.blank import Blank
+from calibration.board.board import Blank
 from calibration.board.corners import Corners
 from calibration.camera import Camera
 from calibration.pose import Pose

@@ -11,7 +11,7 @@ import pytest
 
 from reconstruct.run import presets
 from reconstruct.shading import joint_normals
-from reconstruct.source.options import LONG_SIDES
+from reconstruct.source.source import LONG_SIDES
 
 SIDE = 240  # px
 NORMAL_STEPS = 20  # of 150, when few photos leave the normals of all pixels to be fitted together

@@ -12,7 +12,7 @@ from PIL import Image
 
 from viewer.page.guard import GuardedServer
 from viewer.page.page import Page
-from viewer.page.visitors import Visitors
+from viewer.page.serve import Visitors
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]

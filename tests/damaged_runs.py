@@ -31,7 +31,7 @@ from reconstruct.detail.file import DETAIL, Detail, save_details
 from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields, FurtherView, Verdict, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
-from reconstruct.solve.checkpoint_file import write_checkpoint
+from reconstruct.solve.checkpoint import write_checkpoint
 from viewer.stage.pack_file import write_stage
 
 MARKUP = "<script>alert('shadowgraph')</script><img src=x onerror=alert(1)>&\"'"  # text that must stay text

@@ -18,9 +18,9 @@ from viewer.studio.folder import StudioFolder
 from viewer.studio.sockets import free_socket, http_server
 from viewer.studio.studio import Studio
 from viewer.studio_server.gate import Gate, OwnerSecret
-from viewer.studio_server.phone_routes import PhoneRoutes
 from viewer.studio_server.phones import Phones
 from viewer.studio_server.routes import owner_app
+from viewer.studio_server.serve import PhoneRoutes
 
 ROOT = Path(__file__).parent.parent
 

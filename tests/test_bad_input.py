@@ -9,8 +9,7 @@ from PIL import Image
 
 import shadowgraph
 from capture.errors import CalibrationError
-from reconstruct.source.options import RunOptions
-from reconstruct.source.source import open_source
+from reconstruct.source.source import RunOptions, open_source
 
 SPOT = Path(__file__).parent.parent / "examples" / "spot"
 

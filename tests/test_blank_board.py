@@ -5,8 +5,7 @@ from blank_photos import blank_photo, edges_of
 from board_photos import look_at, slanted
 
 import shadowgraph
-from calibration.board.blank import BLANKS
-from calibration.board.board import parse_board
+from calibration.board.board import BLANKS, parse_board
 from calibration.board.board_photos import fit_board
 from calibration.board.board_pose import fit_ground
 from calibration.board.corners import find_board

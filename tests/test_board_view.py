@@ -8,7 +8,7 @@ import lit_table
 import numpy as np
 import pytest
 
-from capture.checks.board_alignment import BOARD_OFF
+from capture.checks.alignment import BOARD_OFF
 from capture.checks.check_stack import check_stack
 
 N = 12

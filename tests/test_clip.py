@@ -15,9 +15,8 @@ from capture.session.clip import choose_any_frames, choose_board_frames, choose_
 from capture.session.session import load_session
 from reconstruct.run.pipeline import claim, write_thumbnails
 from reconstruct.run_folder.folder import RunFolder
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
-from reconstruct.source.source import open_source
+from reconstruct.source.source import RunOptions, open_source
 from viewer.display.run_follower import RunFollower
 
 N = 20

@@ -14,7 +14,7 @@ from synthetic import BALL, Look, render
 from capture.errors import ReconstructionError
 from capture.files import atomic
 from reconstruct.solve import solver
-from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, previous_of, read_checkpoint, write_checkpoint
+from reconstruct.solve.checkpoint import FINGERPRINT, FORMAT, previous_of, read_checkpoint, write_checkpoint
 from reconstruct.solve.solver import FitConfig, Level, fit
 
 pytestmark = pytest.mark.usefixtures("hull_start")

@@ -7,9 +7,8 @@ from synthetic import BALL, Look, render
 from test_importers import from_above
 
 from calibration.scenes.importers import find_importer, import_folder
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
-from reconstruct.source.source import open_source
+from reconstruct.source.source import RunOptions, open_source
 
 SIDE, PHOTOS = 32, 6
 ROOM = np.linspace(0.02, 0.08, SIDE)[None, :, None] * np.ones((SIDE, 1, 3))  # light of a window

@@ -9,9 +9,8 @@ import pytest
 from calibration.scenes.deepshadow import load_deepshadow
 from capture.errors import CalibrationError, UserError
 from reconstruct.source.calibrate_source import calibrate_source
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
-from reconstruct.source.source import open_source
+from reconstruct.source.source import RunOptions, open_source
 
 SIZE = 32
 LIGHTS = [("cup_0_0", (8.0, 0.5, 2.0)), ("cup_0_1", (-3.0, 7.0, 4.0)), ("cup_0_2", (-6.0, -4.0, 3.0))]

@@ -18,23 +18,20 @@ from reconstruct.appearance.lobe_fit import Samples
 from reconstruct.detail import full_photos as detail_photos
 from reconstruct.detail.detail import estimate_illumination, solve_detail
 from reconstruct.detail.file import DETAIL, SURE, UNIT, load_details, save_details
-from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail, specular_part
+from reconstruct.detail.fit import PixelGloss, detail_at, fit_albedo, fit_detail, specular_part
 from reconstruct.detail.full_photos import FullPhotos, colours_of, full_photos
-from reconstruct.detail.merge import merged, rotated
-from reconstruct.detail.sample import detail_at
-from reconstruct.detail.surface import Window, see_surface
+from reconstruct.detail.surface import Window, merged, rotated, see_surface
 from reconstruct.fields import FurtherView
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.mesh.simplify import simplified
 from reconstruct.mesh.texture import bake, size_for
-from reconstruct.run.detail_stage import detail_is_asked, write_detail
+from reconstruct.run.results import detail_is_asked, write_detail
 from reconstruct.run_folder.folder import KEPT, RunFolder
 from reconstruct.run_folder.once import done_once
 from reconstruct.scene import build_scene
 from reconstruct.shading.noise import Noise
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
-from reconstruct.source.source import Source
+from reconstruct.source.source import RunOptions, Source
 
 
 def said_nothing(done, total, message):

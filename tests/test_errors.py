@@ -11,8 +11,7 @@ from PIL import Image
 
 from capture.errors import FOR_STUDIO, CaptureError, Remedy, UserError
 from capture.files.atomic import write_json
-from shadowgraph.command import main
-from shadowgraph.faults import OPTIONS, sentence_for
+from shadowgraph.command import OPTIONS, main, sentence_for
 from viewer.studio.words import in_page_words
 
 ROOT = Path(__file__).parent.parent

@@ -7,7 +7,7 @@ import trimesh
 from jaxtyping import Float
 
 from reconstruct.mesh import facets
-from reconstruct.mesh.flips import flipped
+from reconstruct.mesh.facets import flipped
 from reconstruct.mesh.mesh import MAX_NODES, ROUNDS, surface_mesh
 from reconstruct.sdf.grid import SdfGrid
 

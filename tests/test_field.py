@@ -5,9 +5,7 @@ import torch
 
 from reconstruct.appearance.brdf import LOBES
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.shadowneus.field import SdfField
-from reconstruct.shadowneus.grid_field import GridField
-from reconstruct.shadowneus.hash_field import HashField, HashLevels
+from reconstruct.shadowneus.field import GridField, HashField, HashLevels, SdfField
 from reconstruct.shadowneus.mlp_field import Materials, Network, NeuralField, Sharpness, specular
 
 REACH, RADIUS, GROUND = 2.0, 1.0, -0.7

@@ -13,6 +13,7 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.reframed import UNPLACED, Doubt, reframed, with_doubt
+from capture.checks.check_stack import check_and_register
 from capture.checks.framing import (
     NOT_SHOWN,
     REFRAMED,
@@ -20,7 +21,6 @@ from capture.checks.framing import (
     ZOOM_STATED,
     framing_findings,
 )
-from capture.checks.moved_photos import check_and_register
 from capture.photos.photo import PhotoStack
 
 N, SIZE = 8, (lit_table.WIDTH, lit_table.HEIGHT)

@@ -10,7 +10,7 @@ from scipy.ndimage import binary_erosion
 
 from reconstruct.config import FitConfig, Level
 from reconstruct.hull import bent_hull
-from reconstruct.hull.hull_front import on_front
+from reconstruct.hull.bent_hull import on_front
 from reconstruct.initialization import choose_start
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer

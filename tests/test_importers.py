@@ -34,9 +34,8 @@ from reconstruct.render.g_buffer import surface_maps
 from reconstruct.run.presets import preset
 from reconstruct.scene import build_scene
 from reconstruct.source.calibrate_source import calibrate_source
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
-from reconstruct.source.source import open_source
+from reconstruct.source.source import RunOptions, open_source
 
 STONE = (Box((-200, -200, 0), (200, 200, 30)), Sphere((0, 0, 30), 25), Sphere((-25, 20, 22), 22))
 

@@ -9,9 +9,8 @@ from synthetic import BALL, Look, render
 
 from calibration.scenes.shadowneus import ShadowNeus, load_known_scene
 from capture.errors import CalibrationError, CaptureError, UserError
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
-from reconstruct.source.source import open_source
+from reconstruct.source.source import RunOptions, open_source
 
 
 def write_scene(folder, look=None, light_type=None, pictures="both", shapes=(BALL,)):

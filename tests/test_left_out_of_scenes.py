@@ -24,9 +24,8 @@ from calibration.scenes.importers import import_folder
 from capture.errors import CaptureError, UserError
 from reconstruct.check.verdict import read_and_check
 from reconstruct.source.calibrate_source import calibrate_source
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
-from reconstruct.source.source import open_source
+from reconstruct.source.source import RunOptions, open_source
 
 SIDE, PHOTOS = 48, 8
 

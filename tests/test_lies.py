@@ -16,12 +16,10 @@ from reconstruct.labels.held_out import hold_out
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import placed_rays, supervise
 from reconstruct.lies import alignment
-from reconstruct.lies.alignment import SeenSurface, align, seen_surface
-from reconstruct.lies.merged import merged_surface
+from reconstruct.lies.alignment import SeenSurface, align, angle_between, even_rotations, seen_surface, stepped
 from reconstruct.lies.motion_refine import LieRays, compare, refined_motion
 from reconstruct.lies.noise import mean_difference
-from reconstruct.lies.rotations import angle_between, even_rotations, stepped
-from reconstruct.lies.together import SolvedLie, lay_together
+from reconstruct.lies.together import SolvedLie, lay_together, merged_surface
 from reconstruct.render.g_buffer import seen_material
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid

@@ -11,10 +11,9 @@ from test_lies import QUICK, SHAPES, grid_of, lying, off
 from calibration.pose import Pose
 from reconstruct.fields import Fields
 from reconstruct.lies import confirmed as confirmation
-from reconstruct.lies.alignment import Alignment
+from reconstruct.lies.alignment import Alignment, stepped
 from reconstruct.lies.confirmed import Met, confirmed, how_met, withheld
 from reconstruct.lies.motion_refine import MotionTrial
-from reconstruct.lies.rotations import stepped
 from reconstruct.lies.together import PlacedLie, SolvedLie, Together
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.solver import begun, fit_surface

@@ -22,10 +22,9 @@ from reconstruct.solve.ray_operators import cross_entropy
 from reconstruct.solve.solver import fit
 from reconstruct.solve.trials import judge, try_lights
 from reconstruct.source.calibrate_source import calibrate_source
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
-from reconstruct.source.source import open_source
-from reconstruct.torch_sdf.compiled import CompiledRays
+from reconstruct.source.source import RunOptions, open_source
+from reconstruct.torch_sdf.ray_field import CompiledRays
 
 RICH = FitConfig(levels=(Level(32, 40, (0.5, 0.4), 3, 5e-4), Level(48, 30, (0.4, 0.1), 2)), votes=1)
 TRIED_TWICE = replace(RICH, levels=(RICH.levels[0], Level(40, 30, (0.4, 0.2), 2), RICH.levels[1]))

@@ -9,7 +9,7 @@ import torch
 from reconstruct.config import FitConfig, Level
 from reconstruct.initialization.choose_start import HULL, HullStart
 from reconstruct.labels.observer import Observer
-from reconstruct.shading.lit_normals import normals_of_lit
+from reconstruct.shading.normal_fit import normals_of_lit
 from tests.synthetic import BALL, Box, Look, render
 
 RAY = torch.tensor([0.0, 0.6, -0.8])

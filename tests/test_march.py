@@ -5,8 +5,7 @@ import torch
 from torch import Tensor
 
 from reconstruct.torch_sdf import march
-from reconstruct.torch_sdf.march import RecordedBlock, State, marched
-from reconstruct.torch_sdf.volume import Volume
+from reconstruct.torch_sdf.march import RecordedBlock, State, Volume, marched
 
 NODES, RAYS = 24, 700
 

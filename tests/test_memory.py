@@ -20,9 +20,8 @@ from reconstruct.run import report_json as summary
 from reconstruct.run_folder import cost
 from reconstruct.run_folder.cost import give_memory_back, memory_room, share_memory_among_threads
 from reconstruct.run_folder.folder import PLAN, RunFolder
-from reconstruct.source.memory import MARGIN, OVERRIDE, plan_for, predicted_memory, read_plan
-from reconstruct.source.options import RunOptions
-from reconstruct.source.source import Source
+from reconstruct.source.photos import MARGIN, OVERRIDE, plan_for, predicted_memory, read_plan
+from reconstruct.source.source import RunOptions, Source
 
 # photos, their size, preset, bytes of private memory at the peak: runs of benchmarks/soak/large.py and of examples/spot
 MEASURED = [

@@ -15,7 +15,7 @@ from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import extract_mesh, preview_mesh, save_mesh, surface_mesh, vertex_colours
-from reconstruct.mesh.photo_colours import PhotoColours
+from reconstruct.mesh.texture import PhotoColours
 from reconstruct.sdf.grid import SdfGrid
 
 RADIUS = 10.0

@@ -7,7 +7,7 @@ import lit_table
 import numpy as np
 import pytest
 
-from capture.checks.moved_photos import RINGING, check_and_register, register
+from capture.checks.check_stack import RINGING, check_and_register, register
 from capture.photos.finding import keep_findings, kept_findings
 from capture.photos.photo import PhotoStack
 

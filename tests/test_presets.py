@@ -10,7 +10,7 @@ from reconstruct.labels.supervision import restricted, supervise
 from reconstruct.run.presets import preset, training, without
 from reconstruct.sdf import kernels
 from reconstruct.shadowneus.config import TrainConfig
-from reconstruct.source.options import RunOptions
+from reconstruct.source.source import RunOptions
 
 
 def test_the_paper_s_preset_is_the_paper_s_settings():

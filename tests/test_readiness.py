@@ -12,16 +12,15 @@ from synthetic import HEAP, Look, Sphere, Truth, render
 import reconstruct.source.source as calibration_source
 import shadowgraph
 from calibration.calibrated_views import CalibratedViews
-from capture.checks.board_alignment import BOARD_OFF
+from capture.checks.alignment import BOARD_OFF
 from capture.errors import CalibrationError, ReconstructionError
 from capture.photos.finding import Finding
 from reconstruct.check import verdict as readiness
 from reconstruct.check.light_coverage import from_the_camera, shadow_cover, side_in_words
 from reconstruct.check.readiness import judge, refuse_hopeless
 from reconstruct.check.verdict import CaptureCheck, tone_doubts
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import Photos
-from reconstruct.source.source import Source
+from reconstruct.source.source import RunOptions, Source
 from viewer.report.check_page import (
     CHOSEN,
     LED,

@@ -22,9 +22,8 @@ from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.scene import build_scene, ground_points
 from reconstruct.solve.solver import fit
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
-from reconstruct.source.source import open_source
+from reconstruct.source.source import RunOptions, open_source
 
 SMALL = FitConfig(levels=(Level(24, 20, (0.5, 0.4), 3, 5e-4), Level(40, 25, (0.4, 0.1), 2)))
 

@@ -12,9 +12,8 @@ from calibration.calibrated_views import load_views, save_views
 from examples.generator.options import Around, Exposure, Flashlight, Further, Phone, Setup, Table, Thing
 from reconstruct.check.verdict import check_capture
 from reconstruct.source.calibrate_source import calibrate_source
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
-from reconstruct.source.source import open_source
+from reconstruct.source.source import RunOptions, open_source
 
 DRAFT = RunOptions(preset="draft")
 SMALL = Setup(

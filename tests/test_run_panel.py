@@ -19,7 +19,7 @@ from reconstruct.sdf.grid import SdfGrid
 from viewer.display.run_follower import RunFollower
 from viewer.page.guard import GuardedServer
 from viewer.page.page import Page
-from viewer.report.comparison import Comparison, compare_result, is_shadow_picture
+from viewer.report.pictures import Comparison, compare_result, is_shadow_picture
 
 
 @pytest.fixture(scope="module")

@@ -13,9 +13,8 @@ from capture.session.session import load_settings, parse_length
 from reconstruct.fields import Fields
 from reconstruct.scene import irradiance
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.source.options import RunOptions
-from reconstruct.source.scale import in_millimetres, with_scale_of
-from reconstruct.source.source import open_source
+from reconstruct.source.calibrate_source import in_millimetres, with_scale_of
+from reconstruct.source.source import RunOptions, open_source
 
 RADIUS = 25.0
 ON_GROUND = Sphere((0.0, 0.0, RADIUS), RADIUS)

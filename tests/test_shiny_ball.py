@@ -15,9 +15,8 @@ from reconstruct.fields import Fields
 from reconstruct.run.ball_on_ground import without_ball
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.source.calibrate_source import calibrate_source
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
-from reconstruct.source.source import open_source
+from reconstruct.source.source import RunOptions, open_source
 
 SIDE, BALL = 240, Ball(178.0, 62.0, 22.0)
 LUMP = Sphere((-20.0, -25.0, 30.0), 30.0)

@@ -16,8 +16,7 @@ from calibration.ground.shadow_reach import most_height
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.side_photos.ground_look import TripodView, stood_there
-from calibration.side_photos.side_pose import side_pose
-from calibration.side_photos.side_views import TripodObject
+from calibration.side_photos.side_views import TripodObject, side_pose
 from calibration.side_photos.silhouette import find_silhouette, possible_region, share_shown
 from calibration.side_view import SideView
 from capture.errors import CalibrationError, CaptureError

@@ -11,7 +11,7 @@ from synthetic import BALL, Look, render
 from reconstruct.config import FitConfig, Level
 from reconstruct.run.presets import continued, preset
 from reconstruct.run.report_json import _requests
-from reconstruct.run.request_steering import RequestSteering
+from reconstruct.run.solve_stage import RequestSteering
 from reconstruct.run_folder.folder import RunFolder, read_log
 from reconstruct.run_folder.requests import ON_REQUEST, PAUSED, REQUESTS, make_request, open_requests, withdraw
 from reconstruct.solve.solver import NO_STEERING, fit_steered

@@ -14,8 +14,7 @@ from waiting import wait_until
 
 from capture.errors import CaptureError, UserError
 from capture.files.atomic import write_json
-from viewer.studio.folder import StudioFolder
-from viewer.studio.trash import Trash
+from viewer.studio.folder import StudioFolder, Trash
 from viewer.studio_server.serve import serve
 
 

@@ -9,8 +9,8 @@ from test_studio import capture_in, program, run_in  # noqa: F401  a fixture
 from test_studio_browser import DESKTOP, PHONE, RULES, browser, opened  # noqa: F401  a fixture
 
 from capture.errors import CaptureError
-from capture.session.contents import photos_of
 from capture.session.session import load_settings
+from capture.session.skipped import photos_of
 from reconstruct.stored_run.stage_pack import opened_pack
 from viewer.studio import example, studio
 

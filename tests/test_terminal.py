@@ -13,7 +13,7 @@ from waiting import PATIENCE_S
 
 from capture.errors import CaptureError
 from reconstruct.run_folder.folder import Progress, RunFolder, read_log
-from shadowgraph.faults import sentence_for
+from shadowgraph.command import sentence_for
 from shadowgraph.terminal import LINE_EVERY_S, Display, print_lines
 
 ROOT = Path(__file__).parent.parent

@@ -18,8 +18,8 @@ from reconstruct.solve.backend import solver_device
 from reconstruct.solve.ray_operators import RayOperators
 from reconstruct.solve.solver import fit
 from reconstruct.torch_sdf import rays as torch_march
+from reconstruct.torch_sdf.march import Volume
 from reconstruct.torch_sdf.ray_field import ray_field
-from reconstruct.torch_sdf.volume import Volume
 
 NODES = 40
 TORCH = torch.device("cpu")

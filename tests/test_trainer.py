@@ -15,14 +15,13 @@ from reconstruct.labels.observer import Observer
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.run import solve_stage
 from reconstruct.shadowneus import trainer
-from reconstruct.shadowneus.checkpoint import load_training, save_training
 from reconstruct.shadowneus.config import ABLATIONS, ShadowSamples, TrainConfig, Weights, ablated
-from reconstruct.shadowneus.hash_field import HashLevels
+from reconstruct.shadowneus.field import HashLevels
 from reconstruct.shadowneus.mlp_field import Network
 from reconstruct.shadowneus.model import Model
 from reconstruct.shadowneus.train_pixels import make_train_pixels
 from reconstruct.shadowneus.train_step import losses
-from reconstruct.shadowneus.trainer import finished, iterations, train
+from reconstruct.shadowneus.trainer import finished, iterations, load_training, save_training, train
 from reconstruct.shadowneus.unit_frame import object_frame, unit_height
 
 BALL = Sphere((12.0, -6.0, 32.0), 32.0)

@@ -13,12 +13,10 @@ from calibration.ground.ground_field import LONG_SIDE
 from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
-from calibration.views.agreement import FINER, from_one_end, odd_one_out
-from calibration.views.tangents import Silhouette
-from reconstruct.check.judge_views import judge_together
-from reconstruct.check.light_coverage import ShadowCover
+from calibration.views.agreement import FINER, Silhouette, from_one_end, odd_one_out
+from reconstruct.check.light_coverage import ShadowCover, surface_seen
 from reconstruct.check.readiness import judge
-from reconstruct.check.surface_seen import surface_seen
+from reconstruct.check.verdict import judge_together
 
 CAMERA = Camera(504, 378, 530.0, 530.0, 253.0, 186.0, (-0.06, 0.04, 0.0, 0.0, 0.0))
 FINE = FINER * LONG_SIDE  # px of the silhouettes that photos of 756 px and more have

@@ -21,8 +21,7 @@ from capture.errors import CalibrationError, CaptureError
 from capture.session.capture import load_capture
 from capture.session.session import Session, SessionSettings
 from reconstruct.run_folder.folder import content_hash
-from reconstruct.source.options import RunOptions
-from reconstruct.source.source import open_source
+from reconstruct.source.source import RunOptions, open_source
 
 BOARD = parse_board("charuco:5x7:30:22:DICT_4X4_50")
 OTHER = parse_board("charuco:6x4:30:22:DICT_5X5_50")

@@ -9,7 +9,7 @@ from chromium import open_page
 from waiting import wait_until
 
 from viewer.page.guard import GuardedServer
-from viewer.page.visitors import Visitors
+from viewer.page.serve import Visitors
 
 pytestmark = pytest.mark.browser
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from capture.checks.picture_motion import Rotation
+from capture.checks.registration import Rotation
 from capture.decode.exif import focal_in_pixels
 from capture.photos.photo import decode_srgb, encode_srgb, read_photo
 

@@ -33,9 +33,8 @@ from calibration.light import Light
 from capture.errors import UserError
 from capture.photos.finding import Finding
 from reconstruct.check.verdict import read_and_check
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
-from reconstruct.source.source import open_source
+from reconstruct.source.source import RunOptions, open_source
 
 BAR = 0.95
 MAY_STAY = (

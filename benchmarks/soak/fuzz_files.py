@@ -39,9 +39,8 @@ from capture.session.session import load_settings
 from reconstruct.fields import load_fields, save_fields
 from reconstruct.solve.checkpoint import load_state
 from reconstruct.source.calibrate_source import calibrate_source
-from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
-from reconstruct.source.source import open_source
+from reconstruct.source.source import RunOptions, open_source
 
 BATCH = 250
 ROOM = 1_500_000_000  # bytes beyond what the process has after its imports: below 2 GB together

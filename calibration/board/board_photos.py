@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from calibration.board.blank import BLANKS, Blank
-from calibration.board.board import AnyBoard, Board, parse_board
+from calibration.board.board import BLANKS, AnyBoard, Blank, Board, parse_board
 from calibration.board.board_pose import ROBUST_AT, SAME_LENS, fit_ground
 from calibration.board.board_scale import marker_share, scale_doubts, scale_of
 from calibration.board.corners import Corners, Grey, find_board, grey_of, under_the_flashlight

@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from calibration.board.blank import Blank
-from calibration.board.board import AnyBoard, Board
+from calibration.board.board import AnyBoard, Blank, Board
 from calibration.board.corners import Corners, Grey, read_markers
 from calibration.board.printing import DEFAULT_BOARDS
 from capture.decode.exif import Optics

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from calibration.board.blank import Blank
-from calibration.board.board import AnyBoard, Board, opencv_dictionary
+from calibration.board.board import AnyBoard, Blank, Board, opencv_dictionary
 from calibration.board.lattice import find_lattices, flat_view
 from calibration.board.placement import place, placed_markers
 from calibration.board.sheet_edges import find_edges

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 
-from calibration.board.blank import Blank
-from calibration.board.board import AnyBoard
+from calibration.board.board import AnyBoard, Blank
 from calibration.board.board_pose import CORNER_SIGMA, PoseSpread
 from calibration.board.bundle import Lens, Prior, Solution, opencv_lens, see, solve
 from calibration.board.corners import Corners

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from scipy import ndimage
 
-from calibration.board.blank import Blank
+from calibration.board.board import Blank
 from capture.decode.exif import ORDINARY_FOCAL_35MM, focal_in_pixels
 from capture.photos.photo import decode_srgb
 

@@ -1,7 +1,7 @@
 """Find photos that do not show the common view: camera moved, blurred, another scene, something in front.
 
 Every photo is compared with the fine texture that the photos of the board's camera have in common
-(capture.checks.alignment, capture.checks.board_alignment).
+(capture.checks.alignment, capture.checks.alignment).
 """
 
 from collections.abc import Sequence
@@ -11,8 +11,17 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from capture.checks.alignment import ANCHORS, FEWEST_PHOTOS, SHOWN, CommonView, allowed_px, densest
-from capture.checks.board_alignment import HomeView, board_findings, home_view
+from capture.checks.alignment import (
+    ANCHORS,
+    FEWEST_PHOTOS,
+    SHOWN,
+    CommonView,
+    HomeView,
+    allowed_px,
+    board_findings,
+    densest,
+    home_view,
+)
 from capture.checks.edge_sharpness import SMEARED, edge_sharpness
 from capture.checks.registration import is_lit, middle_of, moved_back, texture_of
 from capture.checks.robust import column_spread

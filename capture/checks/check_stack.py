@@ -1,13 +1,36 @@
-"""Find photos that would spoil a reconstruction: flash off, over-exposed, room light, another view."""
+"""Find photos that would spoil a reconstruction: flash off, over-exposed, room light, another view.
 
+Photos that a tapped phone or tripod moved a little are registered: found, measured and moved back.
+
+A tap turns the camera by a fraction of a degree and shifts it by less than a millimetre. A turn about the camera's
+centre moves the pixels by one homography, whatever lies in the picture, so the photo can be brought back to where the
+calibrated camera would have shown it. Its three angles are fitted to the fixed texture (capture.checks.registration).
+Whether that was right is not assumed: the photos are checked again, and one that still lies off stays out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 
-from capture.checks.alignment import FEWEST_PHOTOS
+from capture.checks.alignment import (
+    BOARD_OFF,
+    FEWEST_PHOTOS,
+    MOVED,
+    REFERENCE_PX,
+    HomeView,
+    allowed_px,
+    board_rotation,
+    home_view,
+)
 from capture.checks.ambient_light import shadow_findings
 from capture.checks.camera_motion import view_findings
+from capture.checks.framing import NOT_COMPARED, framing_findings
+from capture.checks.registration import Angles, Homography, Rotation
+from capture.decode.exif import focal_in_pixels
 from capture.photos.channels import largest_channel, mean_of_channels
 from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
@@ -20,6 +43,11 @@ OVER_EXPOSED_WARN = 0.05  # share of saturated pixels
 OVER_EXPOSED_DROP = 0.30
 EXPOSURE_CHANGED = 0.02  # of the median photo's exposure; smaller differences are EXIF rounding
 BLACK = 0.004  # of full scale: the least that the median photo's brightness is taken for
+FARTHEST_PX = 12.0  # at REFERENCE_PX: a larger motion moves the camera's place as well
+ROLLED = 2.0  # a shift alone, found where the camera also rolled, may seem so many times as far
+REGISTERED, ANOTHER_SCENE = "registered", "another scene"  # kinds of finding
+NEAR_ENOUGH = 0.25  # px: a photo nearer than that is left as it is
+RINGING = 3  # px around a saturated one, into which moving back carries its colour
 
 
 def check_stack(
@@ -78,3 +106,145 @@ def _brightness_findings(stack: PhotoStack, dark: PhotoStack | None) -> list[Fin
 def _levels(stack: PhotoStack) -> Float[np.ndarray, " photos"]:
     thinned = mean_of_channels(stack.rgb[:, ::4, ::4])  # a percentile needs no more pixels than that
     return np.percentile(thinned.reshape(len(thinned), -1), BRIGHT_PART, axis=1)
+
+
+def check_and_register(
+    stack: PhotoStack, dark: PhotoStack | None = None, board: PhotoStack | None = None
+) -> tuple[Finding, ...]:
+    """Check photos as check_stack does, and move back, in the stack, those whose camera a tap moved a little.
+
+    A photo that was moved back has a finding of kind "registered", which does not drop it. Where all photos show the
+    board's view zoomed, turned or from another place (capture.checks.framing), each has a finding that says so, and
+    the board's photo tells nothing else of them. The arguments are those of check_stack.
+    """
+    found = check_stack(stack, dark, board)
+    if not any(one.kind == BOARD_OFF and one.drop for one in found):
+        left_out = {one.photo for one in found if one.drop and one.kind not in (MOVED, ANOTHER_SCENE)}
+        framed = framing_findings(stack, [i for i, p in enumerate(stack.paths) if p not in left_out], board)
+        if framed and framed[0].kind == NOT_COMPARED:  # what check_stack saw of the board counts
+            found = (*framed, *found)
+        elif framed:
+            return _in_order(stack, [*check_and_register(stack, dark), *framed])
+    own, to_board = _motions(stack, found, board)
+    if not own and to_board is None:
+        return found
+    before = {i: (stack.rgb[i].copy(), stack.clipped[i].copy()) for i in own}
+    for i, motion in own.items():
+        _move_back(stack, i, motion)
+    again = check_stack(stack, dark, board if board is None or to_board is None else _as_seen(board, to_board))
+    for i, pixels in before.items():
+        stack.rgb[i], stack.clipped[i] = pixels
+    told = {finding.photo: finding for finding in found if _is_motion(finding)}
+    off = {finding.photo for finding in again if _is_motion(finding)}
+    kept = [told.get(one.photo, one) if _is_motion(one) else one for one in again]
+    dropped = {finding.photo for finding in kept if finding.drop}
+    for i, path in enumerate(stack.paths):
+        motion = own.get(i, np.eye(3)) @ (np.eye(3) if to_board is None else np.linalg.inv(to_board))
+        if path not in off | dropped and _shift_of(motion, stack) > NEAR_ENOUGH:
+            kept.append(_registered(stack, path, motion))
+    findings = _in_order(stack, kept)
+    register(stack, findings)
+    return findings
+
+
+def _in_order(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    order = {path: i for i, path in enumerate(stack.paths)}
+    return tuple(sorted(findings, key=lambda finding: order[finding.photo]))
+
+
+def register(stack: PhotoStack, findings: Sequence[Finding]) -> None:
+    """Move back, in the stack, the photos that have a finding of kind "registered"."""
+    for finding in findings:
+        if finding.kind == REGISTERED and finding.homography is not None:
+            _move_back(stack, stack.paths.index(finding.photo), np.reshape(finding.homography, (3, 3)))
+
+
+def _move_back(stack: PhotoStack, photo: int, motion: Homography) -> None:
+    """Resample a photo to what the others' camera would have seen.
+
+    Args:
+        motion: from the pixels of the common view to those of the photo.
+    """
+    near = np.ones((2 * RINGING + 1, 2 * RINGING + 1), np.uint8)
+    tainted = cv2.dilate(stack.clipped[photo].astype(np.uint8), near)
+    stack.rgb[photo] = np.maximum(_warped(stack.rgb[photo], motion, cv2.INTER_LANCZOS4), 0)
+    stack.clipped[photo] = _warped(tainted, motion, cv2.INTER_NEAREST) > 0
+
+
+def _as_seen(board: PhotoStack, motion: Homography) -> PhotoStack:
+    """The photo of the board as the group's camera would have seen it."""
+    moved = replace(board, rgb=board.rgb.copy(), clipped=board.clipped.copy())
+    _move_back(moved, 0, motion)
+    return moved
+
+
+def _warped(picture: np.ndarray, motion: Homography, flags: int) -> np.ndarray:
+    size, flags = (picture.shape[1], picture.shape[0]), flags | cv2.WARP_INVERSE_MAP
+    return cv2.warpPerspective(picture, motion, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _is_motion(finding: Finding) -> bool:
+    return finding.kind in (MOVED, BOARD_OFF)
+
+
+def _registered(stack: PhotoStack, path: Path, motion: Homography) -> Finding:
+    to_file = stack.full_width / stack.rgb.shape[2]
+    length = to_file * _shift_of(motion, stack)
+    limit = FARTHEST_PX * stack.full_width / REFERENCE_PX
+    text = f"the view lay {length:.1f} px off, as after a tap on the phone; the photo was moved back and is used"
+    return Finding(path, REGISTERED, text, length, limit, False, tuple(float(value) for value in motion.ravel()))
+
+
+def _shift_of(motion: Homography, stack: PhotoStack) -> float:
+    """The motion of the middle of the picture, px of the stack."""
+    middle = np.array([(stack.rgb.shape[2] - 1) / 2, (stack.rgb.shape[1] - 1) / 2, 1.0])
+    moved = motion @ middle
+    return float(np.hypot(*(moved[:2] / moved[2] - middle[:2])))
+
+
+def _motions(
+    stack: PhotoStack, found: Sequence[Finding], board: PhotoStack | None
+) -> tuple[dict[int, Homography], Homography | None]:
+    """Return the homographies of photos that lie off the group by little, and that of the board's photo if it does."""
+    farthest = FARTHEST_PX * stack.rgb.shape[2] / REFERENCE_PX
+    limit = ROLLED * FARTHEST_PX * stack.full_width / REFERENCE_PX
+    near = [finding for finding in found if _is_motion(finding) and finding.value <= limit]
+    moved = {finding.photo for finding in near if finding.drop}
+    useless = {finding.photo for finding in found if finding.drop} - moved
+    indices = [i for i, path in enumerate(stack.paths) if path not in useless]
+    if not near or len(indices) < FEWEST_PHOTOS:
+        return {}, None
+    home, rotation = home_view(stack, indices, board), _rotation(stack)
+    turns = {i: _own_angles(home, k, rotation) for k, i in enumerate(indices) if stack.paths[i] in moved}
+    own = {i: rotation.homography(one) for i, one in _shared(turns, rotation.focal, home).items()}
+    own = {i: motion for i, motion in own.items() if _shift_of(motion, stack) <= farthest}
+    if board is None or len(near) == len(moved):
+        return own, None
+    angles = board_rotation(board, home, rotation)
+    return own, rotation.homography(angles) if np.isfinite(angles).all() else None
+
+
+def _own_angles(home: HomeView, photo: int, rotation: Rotation) -> Angles:
+    """The rotation from the group's view to a photo's; NaN where nothing tells."""
+    view, start = home.alignment.view, rotation.from_shift(home.alignment.shifts[photo])
+    if not np.isfinite(start).all():
+        return start
+    return home.alignment.points.refined(
+        home.textures[photo], view.brightness[photo], view.others[photo], start, rotation
+    )[0]
+
+
+def _shared(turns: dict[int, Angles], focal: float, home: HomeView) -> dict[int, Angles]:
+    """Give photos whose rotations are alike their median one: after a tap the phone stays where it is.
+
+    One photo's light tells a shift along the grain of wood to some tenths of a pixel only.
+    """
+    known = {i: one for i, one in turns.items() if np.isfinite(one).all()}
+    near = allowed_px(home.textures[0]) / focal
+    alike = {i: [other for other in known.values() if np.linalg.norm(other - one) < near] for i, one in known.items()}
+    return {i: np.median(some, axis=0) for i, some in alike.items()}
+
+
+def _rotation(stack: PhotoStack) -> Rotation:
+    height, width = stack.rgb.shape[1:3]
+    return Rotation(focal_in_pixels(stack.focal_35mm, width, height), width, height)

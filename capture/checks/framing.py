@@ -17,8 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from capture.checks.picture_motion import Homography
-from capture.checks.registration import BLACK
+from capture.checks.registration import BLACK, Homography
 from capture.photos.channels import mean_of_channels
 from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack

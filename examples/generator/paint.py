@@ -7,8 +7,7 @@ from jaxtyping import Float
 from scipy import fft
 from trimesh.visual import ColorVisuals
 
-from calibration.board.blank import Blank
-from calibration.board.board import AnyBoard
+from calibration.board.board import AnyBoard, Blank
 from capture.photos.photo import decode_srgb
 
 from .options import Thing

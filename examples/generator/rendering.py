@@ -13,8 +13,7 @@ import trimesh
 from jaxtyping import Float
 from scipy import ndimage
 
-from calibration.board.blank import Blank
-from calibration.board.board import AnyBoard
+from calibration.board.board import AnyBoard, Blank
 from calibration.camera import Camera
 from capture.errors import CaptureError
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from calibration.calibration import Calibration
 from calibration.lights.power import SHADING_MISFIT
-from capture.checks.board_alignment import BOARD_OFF
+from capture.checks.alignment import BOARD_OFF
 from capture.checks.framing import KINDS, REFRAMED, SEEN_FROM
 from capture.errors import ReconstructionError
 from capture.photos.finding import Finding

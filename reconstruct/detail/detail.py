@@ -20,8 +20,7 @@ from reconstruct.appearance.lobe_fit import Indirect, Samples, from_endless_grou
 from reconstruct.detail.file import SURE, UNIT, Detail
 from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail
 from reconstruct.detail.full_photos import BYTES_PER_SAMPLE, CHANNELS, FullPhotos, PixelFile, colours_of
-from reconstruct.detail.merge import merged
-from reconstruct.detail.surface import LitMap, SeenSurface, find_lit, see_surface
+from reconstruct.detail.surface import LitMap, SeenSurface, find_lit, merged, see_surface
 from reconstruct.fields import Fields
 from reconstruct.labels.field_ground_test import label_ground
 from reconstruct.labels.photometric_stereo import ground_light, with_free_powers

@@ -24,7 +24,7 @@ from capture.files.schema import as_type
 from capture.session.capture import MOST_VIEWS
 from reconstruct.detail.surface import Window
 from reconstruct.fields import BRIGHTEST, MOST_NUMBERS, Fields
-from reconstruct.solve.checkpoint_file import CHECKSUM, FORMAT, checksum, read_whole
+from reconstruct.solve.checkpoint import CHECKSUM, FORMAT, checksum, read_whole
 from reconstruct.tensor_file import Layout, parsed, refuse_outside, write_tensors
 
 VERSION = "1"

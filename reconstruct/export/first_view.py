@@ -20,7 +20,7 @@ from reconstruct.render.receivers import Receivers
 from reconstruct.render.relight import relight_soft
 from reconstruct.render.soft_light import SoftLight
 from reconstruct.render.studio import KEY_DISTANCE, LAMP_RADII, Studio, direction_of, towards
-from reconstruct.sdf.shadow_rays import shadow_starts
+from reconstruct.sdf.rays import shadow_starts
 
 LAMP, SKY = (
     0.7,

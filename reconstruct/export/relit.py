@@ -17,7 +17,7 @@ from capture.decode.panorama import read_panorama
 from capture.errors import ReconstructionError
 from capture.files.title import file_stem
 from capture.photos.photo import encode_srgb
-from reconstruct.detail.sample import with_detail
+from reconstruct.detail.fit import with_detail
 from reconstruct.export.export import Contents, ExportOptions, OnProgress
 from reconstruct.export.film import checked_frames, checked_width, read_film, with_progress
 from reconstruct.export.video import write_film

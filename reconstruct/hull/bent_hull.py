@@ -16,20 +16,29 @@ of .039 and .036, tied .013 and .009; a vase of 19 lights 2.9 mm, tied 3.9.
 
 Likewise for the normals of shadow pictures, `integrate_behind`: a dome over a flat top had an error of .095, bent .062;
 a round body .033 and .030.
+
+A hull behind the integral of normals: the start where few lights leave the depth of what the camera sees open.
+
+Five lights prove little of the space along a ray empty, and ground that is dark by chance makes wrong places on it as
+likely as the right one: an ear became a fan of shreds, in front of its place and behind it. What a camera sees is, for
+the most part, one surface, though. Its depth is integrated from the normals of shading, over what is no break in
+shading, and the hull is made anew behind it. How thick it is there, nothing says: it is taken to be as thick as wide.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+import cv2
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from reconstruct.config import FitConfig
-from reconstruct.hull.follow_normals import Integrate, follow_normals, normals_bias
-from reconstruct.hull.hull_front import on_front
+from reconstruct.hull.follow_normals import Integrate, SomePixels, follow_normals, normals_bias, some_pixels
 from reconstruct.hull.hull_matter import matter_of_hull
+from reconstruct.hull.hull_parts import without_specks
 from reconstruct.hull.normal_integration import LIKELY, integrate_behind, integrate_normals, integrate_within, likeness
 from reconstruct.labels.held_out import draw_blocks, hold_out
 from reconstruct.labels.labels import Labels
@@ -39,6 +48,8 @@ from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
 
+THINNEST = 2.0  # nodes: of matter behind the front
+SPECK = 0.05  # of the largest part: smaller ones were shreds of what is now elsewhere
 SHADING_ROUNDS = 4  # of estimating the normals on a hull and moving it to their integral, at most
 LIT_ROUNDS = 2  # the same from the lights that reach each pixel of shadow pictures
 SETTLED = 0.5  # voxels: a median move too small to recompute the labels
@@ -48,10 +59,65 @@ JUDGES_BLOCK, JUDGES_SHARE = 1, 0.05
 FEW_LIGHTS = 20  # up to which the hull has normals of its own
 CLEARLY = 0.85  # of a hull's shadow error: it is taken bent below it; .79 was better
 BENT_CLEARLY = 0.65  # the same for another bend: of better ones it was .57 at most, of worse ones .73
-
 Say = Callable[[str], None]  # takes a sentence about the step that begins
 Seen = tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]  # see Observer.seen
 Bend = Callable[[SdfGrid, Seen, Labels], SdfGrid]  # bends the surface
+
+
+def on_front(
+    hull: SdfGrid,
+    space: SdfGrid,
+    scene: Scene,
+    seen: tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]],
+    first: Float[Tensor, "height width 3"],
+    labels: Labels,
+) -> SdfGrid:
+    """Return the hull behind the integral of the labels' normals.
+
+    Args:
+        hull: as it was carved.
+        space: that nothing proves empty.
+        seen: world points and normals of the present surface, where each pixel's ray meets it; normals 0 on ground.
+        first: world, where each pixel's ray meets that space.
+
+    Returns:
+        The grid is no distance function, only its sign is valid.
+    """
+    some = some_pixels(scene, *seen, labels)
+    if some is None:
+        return hull
+    front = (first - scene.eye).norm(dim=-1)[:: some.step, :: some.step].numpy().astype(np.float64)
+    depth = integrate_normals(some.rays, some.before, some.own, some.normals, some.trust, True, front)
+    return _behind(depth, some, hull, space, scene)
+
+
+def _behind(
+    depth: Float[np.ndarray, "height width"], some: SomePixels, hull: SdfGrid, space: SdfGrid, scene: Scene
+) -> SdfGrid:
+    """Return the part of a hull behind a front of given ray lengths, with matter of that space right behind it."""
+    there = np.isfinite(depth).astype(np.uint8)
+    kind = cv2.DIST_LABEL_PIXEL
+    _, number = cv2.distanceTransformWithLabels(1 - there, cv2.DIST_L2, 5, labelType=kind)
+    nearest = np.zeros(number.max() + 1)
+    nearest[number[there > 0]] = depth[there > 0]
+    front = nearest[number]
+    pixel = float(np.median(np.linalg.norm(np.diff(some.rays, axis=1), axis=-1)))
+    thick = 2 * cv2.distanceTransform(there, cv2.DIST_L2, 5) * pixel * front
+    shape = space.values.shape
+    nodes = space.origin.numpy() + space.spacing * np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 3)
+    uv = (scene.posed_camera.project(nodes) / some.step).astype(np.float32).reshape(shape[0], -1, 2)
+    edge = cv2.BORDER_REPLICATE
+    begins, lasts = (
+        cv2.remap(image.astype(np.float32), uv, None, cv2.INTER_LINEAR, borderMode=edge).reshape(shape)
+        for image in (front, thick)
+    )
+    away = np.linalg.norm(nodes - scene.eye.numpy(), axis=-1).reshape(shape)
+    behind = away - begins - np.maximum(lasts, THINNEST * space.spacing)
+    behind = np.where(lasts > 0, np.maximum(space.values.numpy(), behind), space.spacing)
+    own = hull.sdf(torch.from_numpy(nodes).float()).numpy().reshape(shape)
+    values = np.maximum(np.minimum(own, behind), begins - away)
+    values[(values < 0) & ~without_specks(values < 0, SPECK)] = space.spacing
+    return SdfGrid(torch.from_numpy(values.astype(np.float32)), space.origin, space.spacing)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from reconstruct.labels.ground_test import GroundTest
 from reconstruct.labels.photometric_stereo import ObjectLabels
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
+from reconstruct.sdf.rays import shadow_starts, unshadowed
 from reconstruct.shading.noise import DEFAULT_NOISE
 
 SURE_NORMAL = 0.5  # confidence: of the pixels that the lobes are learnt from

@@ -12,7 +12,7 @@ from reconstruct.labels.outline import dilated
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import visibility
-from reconstruct.shading.lit_normals import normals_of_lit
+from reconstruct.shading.normal_fit import normals_of_lit
 
 TRUST = 0.3  # of the confidence of a normal from shading: a cut sphere leaves some degrees open
 EDGE_SHARE = 0.25  # of the confidence at the outline, where a pixel mixes two surfaces

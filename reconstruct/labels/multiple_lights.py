@@ -12,7 +12,7 @@ from reconstruct.labels.ground_test import GroundTest
 from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.scene import Scene, grey_irradiance, ground_points
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
+from reconstruct.sdf.rays import shadow_starts, unshadowed
 
 MOST_LIGHTS = 4  # in one photo: 16 levels between dark and full light, a few per cent apart, are all a photo resolves
 LEVEL_SIGMA = 0.04  # of the full light: error of a level by the light model and the surface

@@ -10,6 +10,8 @@ a refusal in a sentence.
    what a lie did not see is a guess.
 3. Two different motions that fit equally well, within the noise of their difference, are told apart by colour, else
    refused.
+
+Rotations spread evenly over all of them, and small rigid motions.
 """
 
 from collections.abc import Sequence
@@ -19,15 +21,17 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from reconstruct.fields import Fields
 from reconstruct.lies.noise import mean_difference
-from reconstruct.lies.rotations import angle_between, even_rotations, stepped
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.sdf.grid import SdfGrid
 
+PHI = 2**0.5  # the two irrational numbers of the spiral
+PSI = 1.533751168755204288118041  # psi^4 = psi + 4
 ROTATIONS = 4096  # about 15 degrees apart
 FEWEST_POINTS = 50  # voxels that a lie's cameras see, at least
 FEW_POINTS = 250  # of each lie, for the first score
@@ -47,6 +51,30 @@ BLOCKS = 8  # along the object: distances inside one are correlated
 FITS = 1.5  # voxels: median distance of the seen points from the other's surface, at most
 SAME_PLACE = 1.5  # voxels: points of both lies that show one place of the surface
 DARKEST = 0.01  # albedo below which no ratio is known
+
+
+def even_rotations(count: int) -> Float[np.ndarray, "count 3 3"]:
+    """Return rotations on the Super-Fibonacci spiral [Alexa 2022, Super-Fibonacci Spirals: Fast, Low-Discrepancy
+    Sampling of SO(3)]: 4096 leave no rotation farther than some 15 degrees from one of them.
+    """
+    s = np.arange(count) + 0.5
+    small, large = np.sqrt(s / count), np.sqrt(1 - s / count)
+    alpha, beta = 2 * np.pi * s / PHI, 2 * np.pi * s / PSI
+    quaternions = np.stack(
+        [small * np.sin(alpha), small * np.cos(alpha), large * np.sin(beta), large * np.cos(beta)], 1
+    )
+    return Rotation.from_quat(quaternions).as_matrix()
+
+
+def angle_between(a: Float[np.ndarray, "3 3"], b: Float[np.ndarray, "3 3"]) -> float:
+    """Return the angle of the rotation that brings one orientation to the other, rad."""
+    return float(np.arccos(np.clip((np.trace(a @ b.T) - 1) / 2, -1.0, 1.0)))
+
+
+def stepped(pose: Pose, step: Float[np.ndarray, "6"], about: Float[np.ndarray, "3"]) -> Pose:
+    """Return a motion followed by a small one: a turn (rotation vector, rad) about a point, then a shift."""
+    turn = Rotation.from_rotvec(step[:3]).as_matrix()
+    return Pose(turn @ pose.rotation, turn @ (pose.translation - about) + about + step[3:])
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,8 @@ from calibration.pose import Pose
 from reconstruct.labels.held_out import HeldOuts, draw_blocks, hold_out
 from reconstruct.labels.supervision import placed_rays
 from reconstruct.lies.alignment import SeenSurface, seen_surface
-from reconstruct.lies.merged import merged_surface
 from reconstruct.lies.motion_refine import LieRays
-from reconstruct.lies.together import STILL, PlacedLie, Say, SolvedLie, Together, motion_on_rays
+from reconstruct.lies.together import STILL, PlacedLie, Say, SolvedLie, Together, merged_surface, motion_on_rays
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.trials import judge

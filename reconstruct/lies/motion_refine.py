@@ -21,8 +21,8 @@ from scipy.linalg import block_diag
 from calibration.pose import Pose
 from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out
 from reconstruct.labels.supervision import SURE_ENOUGH, Supervision
+from reconstruct.lies.alignment import stepped
 from reconstruct.lies.noise import mean_difference
-from reconstruct.lies.rotations import stepped
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import visibility

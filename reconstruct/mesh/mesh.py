@@ -17,8 +17,7 @@ from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.appearance.brdf import MetalRough, metal_rough
 from reconstruct.fields import Fields
 from reconstruct.mesh.evidence import vertex_evidence
-from reconstruct.mesh.facets import faced
-from reconstruct.mesh.flips import flipped
+from reconstruct.mesh.facets import faced, flipped
 from reconstruct.mesh.glb import write_glb
 from reconstruct.render.g_buffer import albedo_at, gloss_at, seen_material, surface_maps
 from reconstruct.sdf.grid import SdfGrid

@@ -1,4 +1,7 @@
-"""Unwrap a simplified mesh, and bake colour and normals of the full surface into textures."""
+"""Unwrap a simplified mesh, and bake colour and normals of the full surface into textures.
+
+Colours of a surface that is still being solved: those of the mean of the photos, before any albedo is known.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,16 +14,22 @@ import xatlas
 from jaxtyping import Bool, Float, Integer, UInt8
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
+from torch import Tensor
 from torch.nn.functional import normalize
+from trimesh.visual import ColorVisuals
 
+from calibration.posed_camera import PosedCamera
 from capture.photos.photo import encode_srgb
 from reconstruct.appearance.brdf import MetalRough
 from reconstruct.detail.file import Detail
-from reconstruct.detail.sample import DetailSample, detail_at
+from reconstruct.detail.fit import DetailSample, detail_at
 from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import mesh_material
 from reconstruct.render.g_buffer import NEIGHBOURS, SAME_POINT, SeenMaterial, albedo_at, seen_material
 
+WHITE_SHARE = 0.99  # of the pixels on the object are darker than what is drawn as BRIGHT
+BRIGHT = 0.8  # linear
+FACING = 0.2  # cosine between normal and line of sight from which a vertex takes the colour of its own pixel
 PADDING_TEXELS = 4  # between charts: a seam stays hidden down to a quarter of the size
 SUBTEXEL_BITS = 4  # charts are drawn to a sixteenth of a texel
 NEWTON_STEPS = 3  # from the reduced mesh onto the surface, which is a fraction of a voxel away
@@ -30,6 +39,45 @@ TEXELS_AT_ONCE = 2**18  # about 100 MB of points, corners and weights
 PACKED = 0.6  # share of a picture that charts cover, about
 DARKEST = 1e-3  # albedo: the colour of darker points is too uncertain to scale
 MIN_FACING = 0.2  # least cosine between gradient and face normal; lower at filled cavities and box walls
+
+
+class PhotoColours:
+    """The mean of one camera's photos, and the colours that it gives to meshes."""
+
+    def __init__(self, camera: PosedCamera, photos: Float[Tensor, "photos height width 3"] | None):
+        """Average the photos, linear, on the camera's grid; shadow pictures alone (None) have no colours."""
+        self._camera = camera
+        self._mean = None if photos is None else photos.mean(0).numpy()
+
+    def coloured(self, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+        """Give a mesh its colours per vertex, sRGB, and return it; without photos it stays as it is.
+
+        Vertices that face the camera take the colour of their pixel; what hides them is not looked for. All others take
+        that of the nearest vertex that does. The brightest one per cent is drawn as BRIGHT.
+
+        Args:
+            mesh: world frame, with normals.
+        """
+        if self._mean is None or not len(mesh.vertices):
+            return mesh
+        vertices = np.asarray(mesh.vertices, np.float64)
+        towards = self._camera.centre - vertices
+        cosine = (np.asarray(mesh.vertex_normals) * towards).sum(1) / np.linalg.norm(towards, axis=1)
+        height, width = self._mean.shape[:2]
+        column, row = np.round(self._camera.project_with_depth(vertices)[0]).T
+        faces = np.flatnonzero((cosine > FACING) & (column >= 0) & (column < width) & (row >= 0) & (row < height))
+        if len(faces):
+            mesh.visual = ColorVisuals(mesh, vertex_colors=self._nearest(vertices, faces, row, column))
+        return mesh
+
+    def _nearest(
+        self, vertices: np.ndarray, faces: np.ndarray, row: np.ndarray, column: np.ndarray
+    ) -> UInt8[np.ndarray, "n 3"]:
+        """Return the colour of each vertex: of its pixel, or that of the nearest of those which face the camera."""
+        assert self._mean is not None
+        seen = self._mean[row[faces].astype(np.int64), column[faces].astype(np.int64)]
+        seen = encode_srgb(np.clip(seen * BRIGHT / max(float(np.quantile(seen, WHITE_SHARE)), 1e-6), 0, 1))
+        return np.asarray(seen)[KDTree(vertices[faces]).query(vertices)[1]]
 
 
 @dataclass(frozen=True)

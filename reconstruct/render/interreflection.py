@@ -12,7 +12,7 @@ from reconstruct.fields import Fields
 from reconstruct.render.g_buffer import SurfaceMaps, albedo_at, seen_material, surface_maps
 from reconstruct.render.radiosity import Patches, find_patches, nearest_patches
 from reconstruct.scene import Scene, irradiance
-from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
+from reconstruct.sdf.rays import shadow_starts, unshadowed
 
 FEWEST_SHADED = 500  # samples; fewer do not determine the interreflection
 ENOUGH_PIXELS = 2000  # of the object, each seen in every photo

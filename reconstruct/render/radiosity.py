@@ -15,8 +15,7 @@ from torch.nn.functional import normalize
 
 from reconstruct.render.receivers import across, disc
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import find_surface
-from reconstruct.sdf.shadow_rays import shadow_starts
+from reconstruct.sdf.rays import find_surface, shadow_starts
 
 OBJECT_PATCHES = 1500  # about: light between surfaces changes slowly along them
 GROUND_PATCHES = 4000  # an eighth of the object's radius apart beside it

@@ -9,8 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import visibility
-from reconstruct.sdf.shadow_rays import RAYS_PER_BATCH, SHARPNESS_PER_VOXEL
+from reconstruct.sdf.rays import RAYS_PER_BATCH, SHARPNESS_PER_VOXEL, visibility
 
 TURN_HASH = (12.9898, 78.233, 37.719)  # of a place, in voxels: neighbours get unrelated fractions
 

@@ -17,7 +17,7 @@ from reconstruct.appearance.brdf import reflectance, specular
 from reconstruct.render.environment import patches, sky_lights, sky_size
 from reconstruct.render.g_buffer import Interreflection, RenderView
 from reconstruct.render.receivers import Receivers, across, disc
-from reconstruct.sdf.shadow_rays import shadow_starts
+from reconstruct.sdf.rays import shadow_starts
 
 RAYS_PER_STEP = 2**18  # of an environment map: a tenth of a second
 PIXELS_AT_ONCE = 2**17  # 27 numbers each: 14 MB

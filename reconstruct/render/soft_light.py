@@ -20,8 +20,7 @@ from reconstruct.render.g_buffer import SeenMaterial, albedo_at
 from reconstruct.render.radiosity import Patches, find_patches, nearest_patches
 from reconstruct.render.receivers import Receivers, across, disc
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import find_surface
-from reconstruct.sdf.shadow_rays import RAYS_PER_BATCH, shadow_starts
+from reconstruct.sdf.rays import RAYS_PER_BATCH, find_surface, shadow_starts
 
 RAYS = 64  # of a point: each stands for 1/64 of the light on it; its neighbours' means take the grain away
 LAMPS = 48  # directions over the hemisphere that four numbers are fitted to

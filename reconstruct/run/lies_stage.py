@@ -18,7 +18,7 @@ from reconstruct.scene import reduced
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.checkpoint import SolveState
 from reconstruct.solve.solver import SolveReporter, begun, fit, fit_surface
-from reconstruct.source.options import LONG_SIDES
+from reconstruct.source.source import LONG_SIDES
 from reconstruct.views import Scenes
 
 SMALL = "draft"  # preset of the lies' own solves: enough for how the object was turned

@@ -25,9 +25,8 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import thread_count, visibility
 from reconstruct.solve.backend import backend_name, solver_device
 from reconstruct.solve.solver import FitConfig
-from reconstruct.source.memory import predicted_memory
-from reconstruct.source.options import LONG_SIDES, RunOptions
-from reconstruct.source.source import Source
+from reconstruct.source.photos import predicted_memory
+from reconstruct.source.source import LONG_SIDES, RunOptions, Source
 
 LOOP_S = 0.5  # of measuring: the rate then repeats within some 10 % on an idle machine
 LOOP_NODES, LOOP_RAYS = 64, 20_000  # a ball in a grid like the solver's second one

@@ -33,23 +33,19 @@ from reconstruct.check.verdict import check_capture
 from reconstruct.fields import Fields, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.run.ball_on_ground import without_ball
-from reconstruct.run.detail_stage import detail_is_asked, write_detail
 from reconstruct.run.machine import kernels_are_compiled, measure_speed, planned_seconds, whole_seconds, work_of
 from reconstruct.run.presets import solver_config
 from reconstruct.run.report_json import summary, versions
-from reconstruct.run.results import save_results
+from reconstruct.run.results import detail_is_asked, save_results, write_detail
 from reconstruct.run.solve_stage import solve
 from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder, content_hash
 from reconstruct.run_folder.forecast import duration_text, plan_numbers
 from reconstruct.run_folder.once import Lazy, ResultFile, done_once, once
 from reconstruct.run_folder.progress import told
 from reconstruct.solve.backend import backend_name, solver_device
-from reconstruct.source.calibrate_source import calibrate_source
-from reconstruct.source.memory import Plan, keep_spread, read_plan
-from reconstruct.source.options import RunOptions
-from reconstruct.source.photos import Photos, memory_plan, read_photos
-from reconstruct.source.scale import in_millimetres, with_scale_of
-from reconstruct.source.source import Source
+from reconstruct.source.calibrate_source import calibrate_source, in_millimetres, with_scale_of
+from reconstruct.source.photos import Photos, Plan, keep_spread, memory_plan, read_photos, read_plan
+from reconstruct.source.source import RunOptions, Source
 from reconstruct.stored_run.maps import THUMBS, thumbnail_name
 
 THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows

@@ -14,9 +14,8 @@ from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
 from reconstruct.run_folder.folder import LOG, PLAN, RunFolder, read_log
 from reconstruct.run_folder.requests import ON_REQUEST
-from reconstruct.source.memory import OVERRIDE, read_plan
-from reconstruct.source.options import RunOptions
-from reconstruct.source.source import Source
+from reconstruct.source.photos import OVERRIDE, read_plan
+from reconstruct.source.source import RunOptions, Source
 from reconstruct.stored_run.documents import CHECK, read_check
 
 if TYPE_CHECKING:

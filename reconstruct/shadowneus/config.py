@@ -3,7 +3,7 @@
 import dataclasses
 from dataclasses import dataclass, replace
 
-from reconstruct.shadowneus.hash_field import HashLevels
+from reconstruct.shadowneus.field import HashLevels
 from reconstruct.shadowneus.mlp_field import Network
 
 ABLATIONS: dict[str, dict[str, bool | str]] = {  # what each changes of a TrainConfig

@@ -4,9 +4,7 @@ import torch
 from torch import nn
 
 from reconstruct.shadowneus.config import TrainConfig
-from reconstruct.shadowneus.field import ball_on_ground
-from reconstruct.shadowneus.grid_field import GridField
-from reconstruct.shadowneus.hash_field import HashField
+from reconstruct.shadowneus.field import GridField, HashField, ball_on_ground
 from reconstruct.shadowneus.mlp_field import Materials, NeuralField, Sharpness
 
 START_POINTS, START_RATE = 1024, 3e-3  # per step of the fit to the ball on the ground, and its learning rate

@@ -1,5 +1,9 @@
-"""ShadowNeuS in plain torch: train any of the three fields with the paper's rays, losses, lights and schedules."""
+"""ShadowNeuS in plain torch: train any of the three fields with the paper's rays, losses, lights and schedules.
 
+Checkpoints of a training: networks and optimiser in one file, written atomically, for an exact resume.
+"""
+
+import json
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -7,7 +11,7 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from capture.errors import ReconstructionError, Remedy
@@ -16,22 +20,68 @@ from reconstruct.labels.multiple_lights import is_shared
 from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene
 from reconstruct.shadowneus.camera_rays import CameraRays, find_hits
-from reconstruct.shadowneus.checkpoint import load_training, save_training
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.model import Model
 from reconstruct.shadowneus.train_pixels import TrainPixels, make_train_pixels
 from reconstruct.shadowneus.train_step import losses
 from reconstruct.shadowneus.unit_frame import UnitFrame, object_frame, read_onto_grid, unit_height
-from reconstruct.solve.checkpoint import fingerprint
+from reconstruct.solve.checkpoint import FINGERPRINT, FORMAT, Log, fingerprint, read_checkpoint, write_checkpoint
 from reconstruct.solve.solver import NO_STEERING, SolveReporter
 from reconstruct.solve.steering import Steering
+from reconstruct.tensor_file import parsed
 
+VERSION = "1"
+MODEL, OPTIMISER = "model.", "optimiser."
 REPORT_EVERY = 10  # iterations
 SHOW_EVERY_S, SHOW_NODES = 60.0, 48  # between reported surfaces, and their nodes: an 8 x 256 MLP takes seconds
 SAVE_EVERY_S = 30.0  # between checkpoints: the work that a kill can lose
 MOST_FAILURES = 5  # iterations in a row without a finite gradient
 SEEDS_APART = 1_000_003  # iterations of one seed share no random numbers with those of the next
 PIXELS_AT_ONCE = 4096  # of the finished albedo
+
+
+def save_training(
+    model: nn.Module, optimiser: torch.optim.Optimizer, iteration: int, fingerprint: str, path: Path
+) -> None:
+    """Write a checkpoint, whole or not at all.
+
+    All random numbers derive from (seed, iteration), so no generator state has to be saved.
+
+    Args:
+        iteration: iterations done.
+        fingerprint: of everything the result depends on.
+
+    Raises:
+        ReconstructionError: a number in it is not finite.
+        OSError: the file cannot be written.
+    """
+    tensors = {MODEL + name: value for name, value in model.state_dict().items()}
+    for place, state in optimiser.state_dict()["state"].items():
+        tensors |= {f"{OPTIMISER}{place}.{name}": value for name, value in state.items()}
+    tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    header = {FORMAT: VERSION, FINGERPRINT: fingerprint, "training": json.dumps({"iteration": iteration})}
+    write_checkpoint(tensors, header, path)
+
+
+def load_training(
+    model: nn.Module, optimiser: torch.optim.Optimizer, fingerprint: str, path: Path, log: Log = lambda _: None
+) -> int:
+    """Load a checkpoint into model and optimiser, and return the iterations done.
+
+    Returns 0 if there is no checkpoint, or it is damaged or belongs to another training; `log` gets the reason.
+    """
+    stored = read_checkpoint(path, VERSION, fingerprint, log)
+    if stored is None:
+        return 0
+    tensors, iteration = stored.tensors, int(parsed(stored.header, "training")["iteration"])
+    model.load_state_dict({n.removeprefix(MODEL): v for n, v in tensors.items() if n.startswith(MODEL)})
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        if name.startswith(OPTIMISER):
+            place, _, quantity = name.removeprefix(OPTIMISER).partition(".")
+            state.setdefault(int(place), {})[quantity] = value
+    optimiser.load_state_dict(optimiser.state_dict() | {"state": state})
+    return iteration
 
 
 def train(

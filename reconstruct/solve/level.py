@@ -8,10 +8,9 @@ from reconstruct.labels.held_out import HeldOut, HeldOuts
 from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
 from reconstruct.sdf.level_set import LevelSet
-from reconstruct.solve.early_stopping import REST, EarlyStopping
+from reconstruct.solve.early_stopping import REST, EarlyStopping, StepGuard
 from reconstruct.solve.light_refine import MovingLights, lit_from
 from reconstruct.solve.operators import JointPasses
-from reconstruct.solve.step_guard import StepGuard
 from reconstruct.views import Scenes, each, photo_names, placed
 
 REDISTANCE_EVERY = REST  # iterations: steps of at most 0.5 voxel stay well inside the band

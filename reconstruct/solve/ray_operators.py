@@ -19,9 +19,9 @@ from reconstruct.sdf.kernels import FAR, GRAZING, GROUND, JITTER, MASK_JITTER, M
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import first_surfaces, run
 from reconstruct.torch_sdf.equations import area_ratio, cross_entropy, moved_intersection
+from reconstruct.torch_sdf.march import central_differences
 from reconstruct.torch_sdf.ray_field import RayField, ray_field
 from reconstruct.torch_sdf.rays import BATCHES
-from reconstruct.torch_sdf.volume import central_differences
 
 LEAST_SHARE = 1e-3  # of a pixel: a smaller part of it has no gradient
 Sums = tuple[float, float]  # of weight * error over rays, and of the weights

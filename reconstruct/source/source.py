@@ -1,7 +1,12 @@
-"""Find out what an input folder holds: photos to calibrate, or a scene with a given calibration."""
+"""Find out what an input folder holds: photos to calibrate, or a scene with a given calibration.
+
+RunOptions: every setting of a run that changes its result.
+"""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from calibration.board.board import parse_board
 from calibration.board.corners import grey_of
@@ -12,7 +17,7 @@ from calibration.scenes.ball_scene import load_with_ball
 from calibration.scenes.ground_depth import find_ground_depth
 from calibration.scenes.importers import find_importer
 from calibration.scenes.listed_lights import load_listed, why_unused
-from capture.errors import CaptureError, Remedy, UserError
+from capture.errors import CalibrationError, CaptureError, Remedy, UserError
 from capture.files.names import clip_of, refuse_no_folder
 from capture.photos.finding import Finding
 from capture.photos.photo import read_photo
@@ -20,10 +25,11 @@ from capture.session.capture import Capture, load_capture
 from capture.session.roles import NoBoardError
 from capture.session.seen import SeenPhotos
 from capture.session.session import SETTINGS_FILE, Session, load_settings, parse_length
-from reconstruct.source.options import AUTO, UNKNOWN, RunOptions, ground_option
 
+AUTO, UNKNOWN = "auto", "unknown"  # of --ground, which may be a height instead
+CALIBRATION_LONG_SIDE = 800  # px: checks and light fit average over patches of ground, finer photos add nothing
+LONG_SIDES = {"draft": 320, "standard": 640, "fine": 1024, "paper": 800}  # px that the solver looks at, by preset
 LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond it, shadows and shading constrain the lights better
-
 DESCRIPTIONS = (
     "*.json",
     "*.txt",
@@ -41,6 +47,55 @@ WITHOUT_BOARD = (
     "found; session.toml may name it: ball = [x, y, radius], pixels)."
 )
 TRAINER_ABLATIONS = ("expected-depth", "sampled")  # the default solver has neither
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Every setting of a run that changes its result."""
+
+    board: str | None = None
+    input: str = "auto"
+    lights: str = "auto"
+    light_error: float = 0.0
+    preset: str = "standard"
+    device: str = "auto"
+    time_budget: float | None = None
+    seed: int = 0
+    split: str = "train"
+    ground: str = "auto"
+    mask: str = "auto"
+    field: str = "auto"
+    ablate: str | None = None
+    detail: str = "auto"
+    memory: float | None = None
+    scale: str | None = None
+
+    def is_trained(self) -> bool:
+        """True if a field is trained in torch (reconstruct/shadowneus/) instead of fitted by the default solver."""
+        return self.preset == "paper" or self.field in ("neural", "hash")
+
+    def long_side(self) -> int:
+        """The longer side (px) of photos as they are read, large enough for checks, calibration and solver."""
+        return max(CALIBRATION_LONG_SIDE, LONG_SIDES[self.preset])
+
+
+def ground_option(option: str) -> float | None:
+    """Return the world z of the ground that --ground gives; None for "auto" and "unknown".
+
+    Raises:
+        CalibrationError: the option is neither of these nor a number.
+    """
+    if option in (AUTO, UNKNOWN):
+        return None
+    try:
+        height = float(option)
+    except ValueError:
+        height = np.nan
+    if not np.isfinite(height):
+        raise CalibrationError(
+            f"--ground {option} is no height; auto, unknown, or the world z of the ground was needed."
+        )
+    return height
 
 
 @dataclass(frozen=True)

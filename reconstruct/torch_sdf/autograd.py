@@ -4,9 +4,9 @@
     seen = transmittance(grid, points, lights, sharpness=20 / spacing)      # one light per point
     shadow_loss(seen, label).mean().backward()                              # values.grad, points.grad, lights.grad
 
-See examples/own_shadow_loss.py. `transmittance` is in the world frame; the solver on a GPU
-(reconstruct/torch_sdf/dense.py) uses DifferentiableSdf and LightRays, in the grid frame. Tensors of one call share a
-device and a floating type, float32 or float64.
+See examples/own_shadow_loss.py. `transmittance` is in the world frame; the solver on a GPU (DenseRays) uses
+DifferentiableSdf and LightRays, in the grid frame. Tensors of one call share a device and a floating type, float32 or
+float64.
 """
 
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ from torch.nn.functional import logsigmoid
 from reconstruct.scene import lights_in_frame
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.kernels import FAR
+from reconstruct.torch_sdf.march import Volume, central_differences
 from reconstruct.torch_sdf.rays import BATCHES, Extrema, extrema, towards
-from reconstruct.torch_sdf.volume import Volume, central_differences
 
 LARGEST = 2.0**16  # bound of one amount that is rounded to a quantum: 2^9 of them on a node sum exactly in float64
 

@@ -2,24 +2,102 @@
 
 A recorded block is some 180 small operations, each of which takes a card longer to start than to compute. A replay runs
 the same operations on the same numbers: its results are those of the block run one by one, to the bit.
+
+An SDF on any torch device: trilinear samples, gradients, and the adjoint of sampling. Grid frame, voxels.
 """
 
 import logging
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+import torch.nn.functional as F
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from reconstruct.sdf.kernels import STEP
-from reconstruct.torch_sdf.volume import Volume
 
+FACE = 1e-3  # voxels that a sample stays away from the upper faces, so that its cell exists
 BLOCK = 8  # samples between two checks of which rays have ended: each check waits for the device
 RECORDED = 2 * BLOCK  # samples of a recorded block, whose rays all go on to the end of the last one
 FEWEST = 2**10  # rays of a recorded block; its number of rays is a power of two
 KEPT = 12  # recorded blocks: their memory is theirs
 LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Volume:
+    """SDF values on a device, with constants for sampling them."""
+
+    phi: Float[Tensor, "nx ny nz"]
+    last: Float[Tensor, "3"]  # node coordinates of the upper corner
+    inside: tuple[Float[Tensor, "3"], Float[Tensor, "3"]]  # the corners that samples are moved between
+    scale: Float[Tensor, "3"]  # from node coordinates to those of grid_sample, which end at -1 and 1
+    offsets: Int[Tensor, "8"]  # from a cell's lower corner to its corners, in the flattened phi
+    stored: Int[Tensor, " nodes"] | None = None  # where the sums of each node are kept; beyond their end: nowhere
+
+    @classmethod
+    def of(cls, phi: Float[Tensor, "nx ny nz"], stored: Int[Tensor, " nodes"] | None = None) -> "Volume":
+        """Make a volume of contiguous SDF values."""
+        _, ny, nz = phi.shape
+        corners = [i * ny * nz + j * nz + k for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+        last = torch.tensor(phi.shape, dtype=phi.dtype, device=phi.device) - 1
+        inside = (torch.zeros_like(last), last - FACE)
+        return cls(phi, last, inside, 2 / last, torch.tensor(corners, device=phi.device), stored)
+
+    def sample(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        """Return the trilinear SDF at points; outside the box, that of the nearest point on it."""
+        if self.phi.device.type == "mps":  # torch lacks grid_sample in three dimensions there
+            index, weight = self.corners(points)
+            return (self.phi.reshape(-1)[index] * weight).sum(-1)
+        scaled = points.clamp(*self.inside) * self.scale - 1
+        volume = self.phi.permute(2, 1, 0)[None, None]  # grid_sample counts its axes from the last one
+        return F.grid_sample(volume, scaled[None, None, None], align_corners=True).reshape(-1)
+
+    def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Return central differences of the trilinear SDF over one voxel; not normalised."""
+        return central_differences(self.sample, points)
+
+    def corners(self, points: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n 8"], Float[Tensor, "n 8"]]:
+        """Return the eight nodes around each point as flat indices, and their trilinear weights."""
+        _, ny, nz = self.phi.shape
+        inside = points.clamp(*self.inside)
+        lower = inside.floor()
+        share = inside - lower
+        cell = lower.long()
+        first = (cell[:, 0] * ny + cell[:, 1]) * nz + cell[:, 2]
+        x, y, z = torch.stack([1 - share, share], -1).unbind(1)
+        weight = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
+        return first[:, None] + self.offsets, weight.reshape(-1, 8)
+
+    def shares(
+        self, points: Float[Tensor, "n 3"], amounts: Float[Tensor, " n"], quantum: float = 0.0
+    ) -> tuple[Int[Tensor, "n 8"], Float[Tensor, "n 8"]]:
+        """Return the eight nodes around each point as flat indices, and their trilinear shares of its amount.
+
+        Args:
+            quantum: shares are rounded to multiples of it, unless 0.
+        """
+        index, weight = self.corners(points)
+        shares = weight.to(amounts.dtype) * amounts[:, None]
+        return index, (shares / quantum).round() * quantum if quantum else shares
+
+    def summed(self, index: Int[Tensor, "n 8"], shares: Float[Tensor, "n 8"], like: Tensor) -> Tensor:
+        """Return the sum of shares at each node, in the shape of `like`: with `shares`, the adjoint of sampling."""
+        places = index.reshape(-1) if self.stored is None else self.stored[index.reshape(-1)]
+        sums = torch.zeros(like.numel() + 1, dtype=shares.dtype, device=shares.device)
+        return sums.index_add_(0, places, shares.reshape(-1))[:-1].view(like.shape)
+
+
+def central_differences(
+    sample: Callable[[Tensor], Tensor], points: Float[Tensor, "n 3"], step: float = 0.5
+) -> Float[Tensor, "n 3"]:
+    """Return a function's gradient at points by differences over `step` each way; differentiable, not normalised."""
+    offsets = step * torch.eye(3, dtype=points.dtype, device=points.device)
+    both = torch.stack([points[:, None] + offsets, points[:, None] - offsets], 1)
+    ahead, behind = sample(both.reshape(-1, 3)).reshape(-1, 2, 3).unbind(1)
+    return (ahead - behind) / (2 * step)
 
 
 class State(NamedTuple):

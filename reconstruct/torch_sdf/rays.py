@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from reconstruct.sdf.kernels import DARK, MAX_MINIMA, REFRACTORY
-from reconstruct.torch_sdf.march import State, forget_blocks, marched
-from reconstruct.torch_sdf.volume import Volume
+from reconstruct.torch_sdf.march import State, Volume, forget_blocks, marched
 
 MISSED = 1e9  # the parameter of a ray that meets nothing
 MOST_RAYS = 2**17  # at once; on 240 nodes 1.2 GiB for camera rays, 0.4 GiB for shadow rays

@@ -1,4 +1,8 @@
-"""view: serve the page of a run folder, and print the address to open."""
+"""view: serve the page of a run folder, and print the address to open.
+
+Each browser window has a page of its own, so that nobody's lamp, layers or view show on another's. Requests to the run
+itself (pause, stop) are files of the run folder: they are seen by all.
+"""
 
 import gc
 import socket
@@ -7,16 +11,44 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import viser
+
 from capture.files.title import title_of
 from reconstruct.run.bundle import user_name
 from reconstruct.run_folder.cost import give_memory_back, share_memory_among_threads
 from reconstruct.stored_run.refusal import refuse_no_run
 from viewer.page.guard import GuardedServer, is_loopback
-from viewer.page.visitors import Visitors
+from viewer.page.page import Page
 from viewer.stage.files import StageFiles
 
 POLL_S = 0.5  # between two looks at the folder: the growing mesh is written every two seconds
 GIVE_BACK_S = 60.0  # takes a twentieth of a second
+
+
+class Visitors:
+    """The pages of all windows that look at one run. One thread calls `poll`."""
+
+    def __init__(self, run_dir: Path, server: viser.ViserServer):
+        """Make a page for whoever comes, and for whoever is here already."""
+        self.pages: dict[int, Page] = {}  # by the number of the window's connection
+        self._run_dir, self._server = run_dir, server
+        self._came = threading.Event()
+        server.on_client_connect(lambda _: self._came.set())
+
+    def wait(self, seconds: float) -> None:
+        """Wait, but not while a new visitor does."""
+        self._came.wait(seconds)
+
+    def poll(self) -> None:
+        """Look for new and for gone visitors, and let every page look for changes of the run."""
+        self._came.clear()
+        clients = self._server.get_clients()
+        for number in self.pages.keys() - clients.keys():
+            self.pages.pop(number)
+        for number, client in clients.items():
+            if number not in self.pages:
+                self.pages[number] = Page(self._run_dir, client, client.camera)
+            self.pages[number].poll()
 
 
 def view(

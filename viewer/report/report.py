@@ -19,7 +19,7 @@ from capture.errors import UserError
 from capture.files.atomic import atomic_file
 from capture.files.regular import is_own_folder
 from reconstruct.fields import Fields
-from reconstruct.source.options import RunOptions
+from reconstruct.source.source import RunOptions
 from reconstruct.stored_run.documents import MANIFEST, REPORT
 from reconstruct.stored_run.maps import DEPTH, THUMBS, Maps, read_maps, read_thumbnails
 from reconstruct.stored_run.ply import read_mesh

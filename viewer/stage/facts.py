@@ -1,4 +1,10 @@
-"""What the page's scripts read about a scene besides its mesh and pictures: one JSON object."""
+"""What the page's scripts read about a scene besides its mesh and pictures: one JSON object.
+
+The cameras of a run and the photos that they took, each with its light, as the page's scripts read them.
+
+All are in the frame of the surface: what a camera saw of another lie is carried there with its lights, so that the page
+knows one object that does not move. The first camera is that of the run's pictures; the others show their photos.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,6 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from calibration.camera import FIELD_MARGIN
+from calibration.light import Light
 from calibration.pose import Pose
 from capture.errors import UserError
 from capture.photos.photo import decode_srgb
@@ -15,12 +23,13 @@ from reconstruct.export.first_view import LAMP, SKY
 from reconstruct.export.stage_scene import FULL_WEIGHT, GROUND_HALF, StageScene
 from reconstruct.fields import Fields
 from reconstruct.mesh.evidence import KINDS
-from reconstruct.render.studio import KEY_DISTANCE, LAMP_RADII, Studio, looking_at, towards
+from reconstruct.render.studio import KEY_DISTANCE, LAMP_RADII, Studio, direction_of, looking_at, towards
 from reconstruct.stored_run.stage_pack import FORMAT
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.stage.cameras import camera_facts, light_facts
 from viewer.stage.pack import Block
 
+MOST_LIGHTS = 200  # markers that are drawn
+STRAIGHT_DOWN = 1.5  # rad: above this elevation a camera's azimuth is told by its picture's lower edge
 BACKGROUND = (24, 26, 31)  # sRGB, as of the page's style
 FADE = (2.5, 7.0)  # radii of the object from its middle, over which ground outside the photo goes into the background
 LARGEST_LAMP = 3.0  # radii of the object
@@ -28,6 +37,75 @@ OUTLINE_WAYS = 200  # 8 degrees apart: an outline is short by less than a hundre
 FIRST_MARGIN = 1.6  # side of the first picture over the object's larger one
 SIGNS = {"seen": "seen", "shadow": "shadow", "guess": "unconstrained"}  # of the legend, in the page's style
 WORDS = {"seen": "seen in the photos", "shadow": "held by shadows", "unconstrained": "a guess"}
+
+
+def camera_facts(seen: Fields, studio: Studio) -> dict[str, Any]:
+    """Return a capture camera in shares of its picture's width and height, so that it holds at every size.
+
+    `home` is the view from its place, towards the object: radians and world length.
+    """
+    camera, pose = seen.camera, seen.world_from_camera
+    pose = pose if seen.object_from_world is None else seen.object_from_world @ pose
+    right, low = camera.width - 1.0, camera.height - 1.0
+    corners = camera.unproject(np.array([[0.0, 0.0], [right, 0.0], [0.0, low], [right, low]]))
+    offset = pose.translation - studio.centre
+    azimuth, elevation = direction_of(offset)
+    if elevation > STRAIGHT_DOWN:
+        azimuth = direction_of(pose.rotation[:, 1])[0]
+    return {
+        "view": seen.view,
+        "eye": pose.translation.tolist(),
+        "axes": pose.rotation.T.tolist(),  # right, down, forward
+        "focal": [camera.fx / camera.width, camera.fy / camera.height],
+        "middle": [(camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height],
+        "distortion": list(camera.distortion),
+        "fisheye": camera.fisheye,
+        "field": FIELD_MARGIN * float(np.hypot(corners[:, 0], corners[:, 1]).max()),
+        "size": [camera.width, camera.height],
+        "home": {"azimuth": azimuth, "elevation": elevation, "distance": float(np.linalg.norm(offset))},
+    }
+
+
+def lit_photos(run: StoredRun) -> list[tuple[str, int, Light, Fields]]:
+    """Return each photo's name, the number of its camera, its light, and what that camera saw.
+
+    A photo of a further view is called VIEW/NAME, as its small copy is.
+
+    Raises:
+        UserError: the run's calibration cannot be read.
+    """
+    return [
+        (f"{name}/{light.photo}" if number else light.photo, number, light, seen)
+        for number, (name, calibration, seen) in enumerate(run.views)
+        for light in calibration.lights
+    ][:MOST_LIGHTS]
+
+
+def light_facts(run: StoredRun, studio: Studio) -> list[dict[str, Any]]:
+    """Return the calibrated lights as places; a direction is a place far away."""
+    try:
+        photos = lit_photos(run)
+    except UserError:
+        return []
+    return [
+        {
+            "photo": name,
+            "camera": number,
+            "place": _place(light, seen, studio).tolist(),
+            "used": light.used,
+            "far": light.position is None,
+        }
+        for name, number, light, seen in photos
+    ]
+
+
+def _place(light: Light, seen: Fields, studio: Studio) -> Float[np.ndarray, "3"]:
+    motion = seen.object_from_world
+    if light.position is not None:
+        return seen.in_common(light.position[None])[0]
+    assert light.direction is not None
+    direction = light.direction if motion is None else motion.rotate(light.direction[None])[0]
+    return studio.centre + KEY_DISTANCE * studio.radius * direction
 
 
 def stage_facts(

@@ -15,8 +15,7 @@ from reconstruct.render.studio import Studio, studio_of
 from reconstruct.stored_run.maps import read_thumbnail
 from reconstruct.stored_run.stage_pack import stage_archive
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.stage.cameras import lit_photos
-from viewer.stage.facts import BACKGROUND, first_window, home_pose, stage_facts
+from viewer.stage.facts import BACKGROUND, first_window, home_pose, lit_photos, stage_facts
 from viewer.stage.pack import Block, jpeg, packed
 
 QUALITY, NORMAL_QUALITY, PHOTO_QUALITY = 90, 95, 82  # JPEG

@@ -10,15 +10,15 @@ from capture.errors import UserError
 from capture.files.regular import is_regular
 from capture.files.title import title_of
 from capture.intake.parts import Parts
-from capture.session.contents import clips_of, folder_role, photos_of
 from capture.session.session import load_settings
+from capture.session.skipped import clips_of, folder_role, photos_of
 from reconstruct.run.queue import FAILED, FINISHED, RUNNING, STOPPED, WAITING, Job, Queue
 from reconstruct.run_folder.folder import LOG
 from reconstruct.stored_run.documents import CHECK, REPORT, read_check, read_manifest, read_report
 from viewer.display.run_follower import RunFollower, status
 from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder
-from viewer.studio.growing import mark_of
+from viewer.studio.live_pages import mark_of
 from viewer.studio.words import without_folder
 
 PRESETS = ("draft", "standard", "fine", "paper")

@@ -18,7 +18,7 @@ from capture.files.regular import is_regular
 from capture.files.title import keep_title, title_of
 from capture.intake.arrivals import KEEP_FREE, refuse_full_disk
 from capture.intake.parts import Parts
-from capture.session.contents import clips_of, photos_of
+from capture.session.skipped import clips_of, photos_of
 from capture.session.write_settings import set_entry, set_role
 from reconstruct.run.batch import PROGRAM, Task
 from reconstruct.run.queue import FINISHED, RUNNING, Job, Queue
@@ -26,13 +26,11 @@ from viewer.stage.files import StageFiles
 from viewer.studio.boards import checked_spec
 from viewer.studio.checking import Checks
 from viewer.studio.example import TITLE, example_photos
-from viewer.studio.folder import StudioFolder
-from viewer.studio.growing import Growing
+from viewer.studio.folder import StudioFolder, Trash
 from viewer.studio.helper import Helper
 from viewer.studio.library import Library
-from viewer.studio.live_pages import LivePages
+from viewer.studio.live_pages import Growing, LivePages
 from viewer.studio.saving import Saving
-from viewer.studio.trash import Trash
 
 TICK_S = 0.5
 LEAVING_S = 5.0  # that a step may take to its end when the studio closes; files that are cut off go on the next time
