@@ -17,7 +17,8 @@ UNCOUNTED functions do without numba's counts of references to arrays, at which 
 make arrays, nor call methods of arrays that do, as max(). INNER functions are called by other kernels alone: no entry
 for Python is compiled for them, and a call from Python would end the process.
 
-The kernels are in one file because numba's cache detects changes of a kernel's own file, not of files it calls into.
+The kernels are in one file because numba's cache detects changes of a kernel's own file, not of files it calls into,
+nor where a named tuple that it takes is defined (CompiledRays): a move of that, too, has to change this file.
 """
 
 import math
