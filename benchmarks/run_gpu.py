@@ -22,7 +22,7 @@ from solves import LOOK, Subject, as_truth, scene_of, score, seen, shown, synthe
 
 from reconstruct.config import FitConfig
 from reconstruct.evaluate.score import compare_views
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.initialization.choose_start import choose_start
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
@@ -108,7 +108,7 @@ def compare_level(scene: Scene, device: torch.device, config: FitConfig, nodes: 
     return row | {"GPU memory, MiB": memory}
 
 
-def solve(subject: Subject, scene: Scene, config: FitConfig, device: torch.device | None) -> tuple[dict, Fields]:
+def solve(subject: Subject, scene: Scene, config: FitConfig, device: torch.device | None) -> tuple[dict, SolvedScene]:
     """A whole solve: wall seconds, of which iterations; its score; memory."""
     stamps: list[tuple[str, float]] = [("", time.perf_counter())]
     report = lambda *, message, **_: stamps.append((message, time.perf_counter()))  # noqa: E731

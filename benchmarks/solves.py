@@ -26,7 +26,7 @@ from capture.errors import UserError
 from reconstruct.config import FitConfig
 from reconstruct.evaluate.metrics import evaluate
 from reconstruct.evaluate.score import Prediction, Reference, compare_views
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.run.presets import preset
@@ -138,7 +138,7 @@ def scene_of(subject: Subject, calibration: Calibration, long_side: int) -> Scen
     return dataclasses.replace(scene, ground_known=subject.ground_known)
 
 
-def solve(subject: Subject, calibration: Calibration, long_side: int, config: FitConfig) -> tuple[Fields, float]:
+def solve(subject: Subject, calibration: Calibration, long_side: int, config: FitConfig) -> tuple[SolvedScene, float]:
     """One solve under a calibration, and its CPU seconds."""
     start = time.process_time()
     solved = fit(scene_of(subject, calibration, long_side), config, silent)
@@ -154,14 +154,14 @@ def with_truth(subject: Subject, named: str, seed: int) -> Subject:
     return dataclasses.replace(subject, name=f"{subject.name}, against its whole solve", truth=truth)
 
 
-def as_truth(solved: Fields, calibration: Calibration) -> Reference:
+def as_truth(solved: SolvedScene, calibration: Calibration) -> Reference:
     """What the calibrated camera sees of a solved scene, for others to be compared with."""
     maps = surface_maps(solved.grid, dataclasses.replace(calibration.posed_camera, ground_height=solved.ground_height))
     depth, normals, mask = maps.depth.numpy(), maps.normals.numpy(), maps.mask.numpy()
     return of_maps(calibration, depth, normals, mask, solved.ground_height)
 
 
-def score(solved: Fields, subject: Subject) -> dict:
+def score(solved: SolvedScene, subject: Subject) -> dict:
     """Every measure of a solved scene by its name."""
     if subject.truth is not None:
         return compare_views(subject.truth, seen(solved, subject.truth), None)
@@ -171,7 +171,7 @@ def score(solved: Fields, subject: Subject) -> dict:
         return evaluate(Path(folder), subject.folder, SAMPLES)
 
 
-def seen(solved: Fields, truth: Reference) -> Prediction:
+def seen(solved: SolvedScene, truth: Reference) -> Prediction:
     """What a solved scene shows the camera of a truth."""
     maps = surface_maps(solved.grid, dataclasses.replace(truth.posed_camera, ground_height=solved.ground_height))
     mask = maps.mask.numpy().ravel()
@@ -180,7 +180,7 @@ def seen(solved: Fields, truth: Reference) -> Prediction:
     return Prediction(depth, normals, mask)
 
 
-def leave(solved: Fields, calibration: Calibration, out: Path) -> None:
+def leave(solved: SolvedScene, calibration: Calibration, out: Path) -> None:
     """The files of a solved scene that scoring reads."""
     out.mkdir(parents=True, exist_ok=True)
     save_calibration(calibration, out / "calibration.json")

@@ -80,19 +80,19 @@ class Verdict:
 
 @dataclass(frozen=True)
 class FurtherView:
-    """What another camera of the same solve saw, as in Fields."""
+    """What another camera of the same solve saw, as in SolvedScene."""
 
     name: str
     albedo: Float[Tensor, "height width 3"]
     camera: Camera
     world_from_camera: Pose
     lights: Float[Tensor, "photos 4"] | None = None
-    gloss_weights: Float[Tensor, "height width materials"] | None = None  # of the lobes of Fields.gloss
-    object_from_world: Pose | None = None  # of another lie: pose and lights are in its own world, see Fields.views
+    gloss_weights: Float[Tensor, "height width materials"] | None = None  # of the lobes of SolvedScene.gloss
+    object_from_world: Pose | None = None  # of another lie: pose and lights are in its own world, see SolvedScene.views
 
 
 @dataclass(frozen=True)
-class Fields:
+class SolvedScene:
     """A solved scene: all that a mesh or a relit picture needs. World frame.
 
     The camera is the first view's. With several views, `further` holds what the others saw of the same surface.
@@ -128,7 +128,7 @@ class Fields:
         """Return points of this view's world in the frame that all views share."""
         return points if self.object_from_world is None else self.object_from_world.apply(points)
 
-    def views(self) -> "tuple[Fields, ...]":
+    def views(self) -> "tuple[SolvedScene, ...]":
         """Return the scene as each of its cameras saw it: each one's albedo, gloss and lights, without the others'.
 
         Where the object was laid anew, its surface is carried into that lie's world, in which the ground is level.
@@ -136,7 +136,7 @@ class Fields:
         return self._each_view
 
     @cached_property
-    def _each_view(self) -> "tuple[Fields, ...]":
+    def _each_view(self) -> "tuple[SolvedScene, ...]":
         found = [replace(self, further=())]
         grids: dict[bytes, SdfGrid] = {}
         for one in self.further:
@@ -152,7 +152,7 @@ class Fields:
             found.append(replace(found[0], **own, lights=one.lights, gloss=gloss, view=one.name))
         return tuple(found)
 
-    def scaled(self, factor: float, unit: str) -> "Fields":
+    def scaled(self, factor: float, unit: str) -> "SolvedScene":
         """Return the same scene in another unit, of which `factor` are one of this one's."""
         grid = SdfGrid(factor * self.grid.values, factor * self.grid.origin, factor * self.grid.spacing)
         further = tuple(replace(one, **_scaled_view(one, factor)) for one in self.further)
@@ -163,10 +163,10 @@ class Fields:
     def __repr__(self) -> str:
         nodes = " x ".join(map(str, self.grid.values.shape))
         surface = "matt" if self.gloss is None else "glossy"
-        return f"Fields({nodes} nodes of {self.grid.spacing:.3g} {self.unit}, {surface})"
+        return f"SolvedScene({nodes} nodes of {self.grid.spacing:.3g} {self.unit}, {surface})"
 
 
-def _scaled_view(view: Fields | FurtherView, factor: float) -> dict[str, Any]:
+def _scaled_view(view: SolvedScene | FurtherView, factor: float) -> dict[str, Any]:
     """Return the pose and the lights of a camera in another unit."""
     lights = view.lights
     if lights is not None:
@@ -179,7 +179,7 @@ def _scaled_view(view: Fields | FurtherView, factor: float) -> dict[str, Any]:
     return {"world_from_camera": pose, "lights": lights, "object_from_world": motion}
 
 
-def as_stored(fields: Fields) -> Fields:
+def as_stored(fields: SolvedScene) -> SolvedScene:
     """Round the fields to the precision of their file, so that a solved scene equals its file."""
     gloss = fields.gloss
     return replace(
@@ -201,8 +201,8 @@ def _half(values: Tensor) -> Tensor:
     return values.clamp(max=BRIGHTEST).half()
 
 
-def save_fields(fields: Fields, path: Path) -> None:
-    """Write Fields as safetensors, with the rest as JSON in the header; whole or not at all."""
+def save_fields(fields: SolvedScene, path: Path) -> None:
+    """Write SolvedScene as safetensors, with the rest as JSON in the header; whole or not at all."""
     tensors = {
         "sdf": fields.grid.values.contiguous(),
         "origin": fields.grid.origin.contiguous(),
@@ -266,8 +266,8 @@ class _Header(_ViewHeader, kw_only=True):
     further: Annotated[tuple[_ViewHeader, ...], Meta(max_length=MOST_VIEWS - 1)] = ()
 
 
-def load_fields(path: Path) -> Fields:
-    """Read Fields from a file written by save_fields, which may be a stranger's.
+def load_fields(path: Path) -> SolvedScene:
+    """Read SolvedScene from a file written by save_fields, which may be a stranger's.
 
     Raises:
         ReconstructionError: the file is missing, damaged, of another format, or holds what no solve leaves: numbers
@@ -284,7 +284,7 @@ def load_fields(path: Path) -> Fields:
         raise ReconstructionError(f"{path}: not a readable result ({why(error)}); {MAKE}") from error
 
 
-def _checked(tensors: Mapping[str, Tensor], rest: _Header) -> Fields:
+def _checked(tensors: Mapping[str, Tensor], rest: _Header) -> SolvedScene:
     """Return the fields of a file.
 
     Raises:
@@ -301,7 +301,7 @@ def _checked(tensors: Mapping[str, Tensor], rest: _Header) -> Fields:
     gloss = _gloss(tensors)
     if "evidence" in tensors and tensors["evidence"].shape != grid.values.shape:
         raise ValueError(f"evidence at {tuple(tensors['evidence'].shape)} nodes was found, at all nodes it was needed")
-    return Fields(
+    return SolvedScene(
         grid,
         first.albedo,
         first.camera,

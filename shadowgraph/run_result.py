@@ -12,7 +12,7 @@ from calibration.calibrated_views import load_views
 from calibration.calibration import Calibration
 from capture.errors import ReconstructionError
 from capture.files.title import title_of
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.stored_run.documents import lit_photos
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.display.run_follower import size_text
@@ -62,7 +62,7 @@ class RunResult:
         return self._run.calibration
 
     @property
-    def fields(self) -> Fields:
+    def fields(self) -> SolvedScene:
         """Return the signed distance field and the materials, for shadowgraph.look and shadowgraph.relight."""
         return self._run.fields
 

@@ -16,7 +16,7 @@ from test_trainer import TINY
 from test_visibility import SHARPNESS, ball, grey_rays
 
 from reconstruct.config import FitConfig, Level
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.trainer import train
@@ -48,7 +48,7 @@ def seen(look: Look) -> Scene:
     return replace(scene, rgb=None) if look.with_shadow else scene
 
 
-def end_alike(found: Fields, expected: Fields, mean: float = 0.01) -> None:
+def end_alike(found: SolvedScene, expected: SolvedScene, mean: float = 0.01) -> None:
     """Two surfaces but for rounding; `mean` and half a voxel are the most that they may be apart, in voxels."""
     apart = (found.grid.values - expected.grid.values).abs() / expected.grid.spacing
     assert apart.mean() < mean and apart.max() < 0.5

@@ -29,7 +29,7 @@ from calibration.side_view import SideView
 from reconstruct.appearance.brdf import LOBES, Gloss
 from reconstruct.detail.file import DETAIL, Detail, save_details
 from reconstruct.detail.surface import Window
-from reconstruct.fields import Fields, FurtherView, Verdict, load_fields, save_fields
+from reconstruct.fields import FurtherView, SolvedScene, Verdict, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
 from reconstruct.solve.checkpoint import write_checkpoint
 from viewer.stage.pack_file import write_stage
@@ -122,7 +122,7 @@ def _side_view(own: Calibration) -> SideView:
     return SideView("side.jpg", own.posed_camera, (4, 4, 32, 24), mask, np.ones_like(mask), 1.0)
 
 
-def _all_known(fields: Fields, n_lights: int) -> Fields:
+def _all_known(fields: SolvedScene, n_lights: int) -> SolvedScene:
     height, width = fields.albedo.shape[:2]
     weights = torch.full((height, width, 1), 0.1)
     return replace(
@@ -134,7 +134,7 @@ def _all_known(fields: Fields, n_lights: int) -> Fields:
     )
 
 
-def _detail(fields: Fields) -> Detail:
+def _detail(fields: SolvedScene) -> Detail:
     height, width = fields.camera.height, fields.camera.width
     normals = np.zeros((height, width, 3), np.int16)
     normals[..., 2] = 32767

@@ -13,7 +13,7 @@ from synthetic import HEAP, Look, Truth, render
 
 from calibration.calibration import Calibration, save_calibration
 from capture.photos.photo import encode_srgb
-from reconstruct.fields import Fields, save_fields
+from reconstruct.fields import SolvedScene, save_fields
 from reconstruct.sdf.grid import SdfGrid
 
 LOWER, SPACING, NODES = np.array([-70.0, -60.0, -6.0]), 2.0, (72, 64, 44)
@@ -37,17 +37,17 @@ def calibration_of(truth: Truth) -> Calibration:
     )
 
 
-def fields_of(truth: Truth) -> Fields:
+def fields_of(truth: Truth) -> SolvedScene:
     axes = [LOWER[i] + SPACING * np.arange(NODES[i]) for i in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     values = torch.from_numpy(truth.sdf(nodes).reshape(NODES)).float()
     grid = SdfGrid(values, torch.from_numpy(LOWER).float(), SPACING)
     albedo = torch.from_numpy(truth.albedo).float()
     pose = truth.calibration.world_from_camera
-    return Fields(grid, albedo, truth.calibration.camera, pose, 0.0, "mm")
+    return SolvedScene(grid, albedo, truth.calibration.camera, pose, 0.0, "mm")
 
 
-def mesh_of(fields: Fields, inflate: float = 0.0) -> trimesh.Trimesh:
+def mesh_of(fields: SolvedScene, inflate: float = 0.0) -> trimesh.Trimesh:
     values = fields.grid.values.numpy() - inflate
     vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(SPACING,) * 3)
     colours = np.tile(np.array([[200, 160, 120, 255]], np.uint8), (len(vertices), 1))

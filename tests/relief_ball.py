@@ -12,7 +12,7 @@ from synthetic import BALL, Look, render
 from calibration.calibration import Calibration
 from calibration.light import irradiance
 from capture.photos.photo import srgb_of
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.sdf.grid import SdfGrid
 
 WAVE, HEIGHT = 3.2, 0.09  # mm: slopes of 10 degrees, a wave of seven pixels
@@ -28,7 +28,7 @@ class Relief:
 
     paths: tuple[Path, ...]
     calibration: Calibration
-    fields: Fields
+    fields: SolvedScene
     normals: Float[np.ndarray, "height width 3"]
     smooth: Float[np.ndarray, "height width 3"]  # of the ball without relief
     albedo: Float[np.ndarray, "height width 3"]
@@ -65,7 +65,7 @@ def bent(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return out / np.maximum(np.linalg.norm(out, axis=-1, keepdims=True), 1e-12)
 
 
-def _solved(calibration: Calibration) -> Fields:
+def _solved(calibration: Calibration) -> SolvedScene:
     """The ball without relief, on a coarse grid, of one colour."""
     lower = np.array([-56.0, -56.0, -8.0])
     axes = [lower[i] + SPACING * np.arange(n) for i, n in enumerate((29, 29, 25))]
@@ -74,7 +74,7 @@ def _solved(calibration: Calibration) -> Fields:
     grid = SdfGrid(torch.from_numpy(values).float(), torch.from_numpy(lower).float(), SPACING)
     camera = calibration.camera.resized(WORKING, WORKING * 3 // 4)
     albedo = torch.from_numpy(np.tile((LIGHT + DARK) / 2, (camera.height, camera.width, 1))).float()
-    return Fields(grid, albedo, camera, calibration.world_from_camera, 0.0, "mm")
+    return SolvedScene(grid, albedo, camera, calibration.world_from_camera, 0.0, "mm")
 
 
 def angles(found: np.ndarray, true: np.ndarray) -> np.ndarray:
@@ -82,6 +82,6 @@ def angles(found: np.ndarray, true: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip((found * true).sum(-1), -1, 1)))
 
 
-def without_texture(fields: Fields) -> Fields:
+def without_texture(fields: SolvedScene) -> SolvedScene:
     """The same surface moved by a hair: another one."""
     return replace(fields, grid=SdfGrid(fields.grid.values + 1e-3, fields.grid.origin, fields.grid.spacing))

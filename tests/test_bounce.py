@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch.nn.functional import normalize
 
 from calibration.light import Light
-from reconstruct.fields import Fields
-from reconstruct.labels.ground_test import no_ground
+from reconstruct.fields import SolvedScene
+from reconstruct.labels.ground_test import empty_ground_test
 from reconstruct.labels.ground_test import test_ground as ground_tested
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.photometric_stereo import label_object
@@ -51,8 +51,8 @@ def from_plane(points: torch.Tensor, normals: torch.Tensor, radiosity) -> Float[
     return np.array(out)
 
 
-def scene(interreflection: float, albedo: float = 0.5) -> Fields:
-    return Fields(
+def scene(interreflection: float, albedo: float = 0.5) -> SolvedScene:
+    return SolvedScene(
         sphere_grid(), torch.full((48, 64, 3), albedo), CAMERA, POSE, 0.0, "scene", interreflection=interreflection
     )
 
@@ -110,7 +110,7 @@ def test_how_white_surfaces_are_shows_in_what_they_send_each_other(true, room, g
     grid = SdfGrid((origin + spacing * nodes - torch.tensor(BALL.centre)).norm(dim=-1) - BALL.radius, origin, spacing)
     albedo, at, facing = (torch.from_numpy(a).float() for a in (truth.albedo, truth.points, truth.normals))
     camera, pose = truth.calibration.camera, truth.calibration.world_from_camera
-    fields = Fields(grid, albedo, camera, pose, 0.0, "mm")
+    fields = SolvedScene(grid, albedo, camera, pose, 0.0, "mm")
     interreflection = photo_interreflection(fields, photos)
     photos = replace(photos, ground_known=ground_known)
     assert interreflection is not None and photos.rgb is not None
@@ -135,7 +135,7 @@ def test_light_between_surfaces_turns_no_normals(ground_known):
     photos.rgb[:, on] += albedo * sent
     observer = Observer(photos)
     points, normals = observer.seen(fields.grid)
-    ground = ground_tested(photos) if ground_known else no_ground(photos)
+    ground = ground_tested(photos) if ground_known else empty_ground_test(photos)
     endless = label_object(photos, points, normals, on.float(), ground).normals
     ours = observer.labels(fields.grid, photos).normals
     in_creases = sent.mean((0, 2)) > sent.mean((0, 2)).quantile(0.7)

@@ -12,7 +12,7 @@ from trimesh.visual import ColorVisuals
 
 from capture.errors import ReconstructionError
 from reconstruct.export.export import ExportOptions, export
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.mesh.edit import Edit, edited_fields, edited_mesh, without_guess
 from reconstruct.mesh.mesh import MAX_NODES, surface_mesh
 from reconstruct.sdf.grid import SdfGrid
@@ -29,7 +29,7 @@ def run(finished_run, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def ball(run) -> Fields:
+def ball(run) -> SolvedScene:
     """A ball around the origin, above a ground far below, in the fields of another run."""
     axis = np.arange(-32.0, 33.0, SPACING)
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
@@ -38,7 +38,7 @@ def ball(run) -> Fields:
     return replace(fields, grid=SdfGrid(values, torch.full((3,), -32.0), SPACING), ground_height=-31.0)
 
 
-def surface(fields: Fields, edit: Edit) -> trimesh.Trimesh:
+def surface(fields: SolvedScene, edit: Edit) -> trimesh.Trimesh:
     fields = edited_fields(fields, edit)
     return surface_mesh(fields.grid, fields.ground_height, MAX_NODES)
 
@@ -56,7 +56,7 @@ def test_smoothing_shrinks_a_ball_by_its_curvature_and_flattens_a_relief(ball):
     assert np.abs(np.ptp(grid[16:48, 32, 32]) - 2 * kept * height).max() < 0.01
 
 
-def _with(fields: Fields, values: torch.Tensor) -> Fields:
+def _with(fields: SolvedScene, values: torch.Tensor) -> SolvedScene:
     return replace(fields, grid=SdfGrid(values, torch.zeros(3), 1.0))
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from calibration.light import Light, irradiance
 from reconstruct.appearance.brdf import Material, facing_reflectance, specular
 from reconstruct.appearance.lobe_fit import Indirect, Samples, fit_lobes, from_endless_ground
-from reconstruct.fields import Fields, load_fields, save_fields
+from reconstruct.fields import SolvedScene, load_fields, save_fields
 from reconstruct.labels.ground_test import test_ground as check_ground
 from reconstruct.labels.highlights import (
     lit_pixels,
@@ -54,14 +54,14 @@ def dark(scene: Scene) -> Indirect:
     return from_endless_ground(torch.zeros(len(scene.lights)))
 
 
-def solved(scene: Scene, truth: Truth) -> Fields:
+def solved(scene: Scene, truth: Truth) -> SolvedScene:
     """The true surface with the material read from the photos."""
     normals = tensor(truth.normals * truth.mask[..., None])
     lit = lit_pixels(scene, ball_grid(), tensor(truth.points), normals)
     albedo, gloss = surface_appearance(scene, tensor(truth.points), normals, lit, dark(scene))
     albedo = torch.where(torch.from_numpy(truth.mask)[..., None], albedo, tensor(truth.albedo))
     pose = truth.calibration.world_from_camera
-    return Fields(ball_grid(), albedo, truth.calibration.camera, pose, 0.0, "mm", gloss=gloss)
+    return SolvedScene(ball_grid(), albedo, truth.calibration.camera, pose, 0.0, "mm", gloss=gloss)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def glossy(matt) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def fields(matt, glossy) -> Fields:
+def fields(matt, glossy) -> SolvedScene:
     return solved(glossy, matt[1])
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from reconstruct.hull.hull_matter import matter_of_hull
+from reconstruct.hull.hull_matter import hull_occupancy
 from reconstruct.hull.normal_integration import integrate_within, likeness
 from reconstruct.labels.labels import Labels
 from reconstruct.sdf.grid import SdfGrid
@@ -51,7 +51,7 @@ def smeared(seen):
 def test_rays_tell_the_rim_from_the_lid(seen, smeared):
     scene, truth, _, hull, labels, *_ = seen
     behind, there, alike = smeared
-    belief = matter_of_hull(hull, scene, labels, behind, 1, alike)
+    belief = hull_occupancy(hull, scene, labels, behind, 1, alike)
     right = (belief > 0.5) == there
     assert right[truth.mask].mean() > 0.9
     assert belief[there & truth.mask].mean() > 0.8
@@ -63,7 +63,7 @@ def test_every_second_pixel_tells_the_same(seen, smeared):
     scene, truth, _, hull, labels, *_ = seen
     behind, there, alike = smeared
     part = (slice(None, None, 2), slice(None, None, 2))
-    belief = matter_of_hull(hull, scene, labels, behind[part], 2, alike[part])
+    belief = hull_occupancy(hull, scene, labels, behind[part], 2, alike[part])
     right = (belief > 0.5) == there[part]
     assert right[truth.mask[part]].mean() > 0.85
 

@@ -11,7 +11,7 @@ from synthetic import Look, Sphere, default_camera, render
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from reconstruct.config import FitConfig, Level
-from reconstruct.fields import Fields, FurtherView, load_fields, save_fields
+from reconstruct.fields import FurtherView, SolvedScene, load_fields, save_fields
 from reconstruct.labels.held_out import hold_out
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import placed_rays, supervise
@@ -150,7 +150,7 @@ def test_lies_of_an_object_of_a_few_voxels_are_named_and_the_first_is_kept():
     small = (Sphere((0.0, 0.0, 4.0), 4.0, COLOUR),)
     scene, _ = render(small, Look(width=32, height=24, n_lights=2), default_camera(32, 24))
     albedo = torch.full((24, 32, 3), 0.5)
-    fields = Fields(grid_of(small), albedo, scene.camera, scene.world_from_camera, 0.0, "mm")
+    fields = SolvedScene(grid_of(small), albedo, scene.camera, scene.world_from_camera, 0.0, "mm")
     found = lay_together((SolvedLie("", (scene,), fields), SolvedLie("turned_1", (scene,), fields)))
     assert not found.placed and "voxels of the object are seen" in dict(found.refused)["turned_1"]
 
@@ -231,7 +231,7 @@ def test_a_solved_scene_of_two_lies_equals_its_file_and_knows_both_worlds(laid, 
     first, _ = render(SHAPES, Look(width=64, height=48, n_lights=2), default_camera(64, 48))
     albedo = torch.full((48, 64, 3), 0.5)
     there = FurtherView("turned_1", albedo, scene.camera, scene.world_from_camera, scene.lights, None, motion)
-    fields = Fields(grid_of(SHAPES), albedo, first.camera, first.world_from_camera, 0.0, "mm", further=(there,))
+    fields = SolvedScene(grid_of(SHAPES), albedo, first.camera, first.world_from_camera, 0.0, "mm", further=(there,))
     save_fields(fields, tmp_path / "fields.safetensors")
     read = load_fields(tmp_path / "fields.safetensors")
     view = read.views()[1]

@@ -9,7 +9,7 @@ from synthetic import Look, default_camera, render
 from test_lies import QUICK, SHAPES, grid_of, lying, off
 
 from calibration.pose import Pose
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.lies import confirmed as confirmation
 from reconstruct.lies.alignment import Alignment, stepped
 from reconstruct.lies.confirmed import Met, confirmed, how_met, withheld
@@ -27,7 +27,9 @@ def solved(name: str, shapes, seed: int) -> SolvedLie:
     scene, _ = render(shapes, Look(width=64, height=48, n_lights=6, seed=seed), default_camera(64, 48))
     scene = replace(scene, view=name)
     albedo = torch.full((48, 64, 3), 0.5)
-    return SolvedLie(name, (scene,), Fields(grid_of(shapes), albedo, scene.camera, scene.world_from_camera, 0.0, "mm"))
+    return SolvedLie(
+        name, (scene,), SolvedScene(grid_of(shapes), albedo, scene.camera, scene.world_from_camera, 0.0, "mm")
+    )
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from synthetic import BALL, HEAP, Look, render
 
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.hull.shadow_hull import carved
 from reconstruct.initialization.light_contradictions import contradictions
 from reconstruct.labels.labels import assemble_labels
@@ -64,7 +64,7 @@ def test_pieces_in_the_air_are_warned_of_and_objects_on_the_ground_are_not():
     scene, _ = render((BALL,), replace(LOOK, n_lights=1, width=16, height=12))
     camera, pose = scene.camera, scene.world_from_camera
     grid = SdfGrid(torch.ones(2, 2, 2), torch.zeros(3), 1.0)
-    fields = Fields(grid, torch.zeros(12, 16, 3), camera, pose, 0.0, "mm")
+    fields = SolvedScene(grid, torch.zeros(12, 16, 3), camera, pose, 0.0, "mm")
     box = trimesh.creation.box(bounds=[[0, 0, 0], [10, 10, 10]])
     beside, above = box.copy().apply_translation([20, 0, 0]), box.copy().apply_translation([0, 0, 30])
     assert pieces(box, fields) == []

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from calibration.camera import Camera
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.mesh.mesh import extract_mesh, preview_mesh, save_mesh, surface_mesh, vertex_colours
 from reconstruct.mesh.texture import PhotoColours
 from reconstruct.sdf.grid import SdfGrid
@@ -29,11 +29,11 @@ def sphere_grid(height: float, spacing: float = 1.0, extra: int = 3) -> SdfGrid:
     return SdfGrid(nodes.norm(dim=-1) - RADIUS, torch.tensor([-half, -half, height - half]), spacing)
 
 
-def solved(grid: SdfGrid, unit: str = "mm") -> Fields:
+def solved(grid: SdfGrid, unit: str = "mm") -> SolvedScene:
     """Seen from straight above, all red."""
     camera = Camera(60, 60, 120.0, 120.0, 29.5, 29.5)
     pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 80.0]))
-    return Fields(grid, torch.tensor(RED).expand(60, 60, 3).contiguous(), camera, pose, 0.0, unit)
+    return SolvedScene(grid, torch.tensor(RED).expand(60, 60, 3).contiguous(), camera, pose, 0.0, unit)
 
 
 def glb_parts(path: Path) -> tuple[dict, bytes]:

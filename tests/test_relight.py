@@ -12,7 +12,7 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from reconstruct.appearance.brdf import MATERIALS, Gloss, Material, conserving, reflectance
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.render.environment import WHITE_PAPER, exposed, ground_light, patches, sky_lights
 from reconstruct.render.g_buffer import RenderView, look, surface_maps
 from reconstruct.render.relight import environment, lit_share, relight
@@ -40,9 +40,9 @@ CAMERA = Camera(64, 48, 70.0, 70.0, 31.0, 24.5, (0.1, -0.05, 0.002, -0.001, 0.0)
 POSE = looking_at((0.3, -3.0, 2.2))
 
 
-def fields(albedo: torch.Tensor | None = None) -> Fields:
+def fields(albedo: torch.Tensor | None = None) -> SolvedScene:
     albedo = torch.full((48, 64, 3), 0.5) if albedo is None else albedo
-    return Fields(sphere_grid(), albedo, CAMERA, POSE, 0.0, "scene")
+    return SolvedScene(sphere_grid(), albedo, CAMERA, POSE, 0.0, "scene")
 
 
 def everywhere(view: RenderView, material: Material) -> RenderView:
@@ -173,7 +173,7 @@ def test_a_surrounding_equals_the_sum_over_all_texels_to_a_hundredth():
 
 @pytest.mark.parametrize("sky", [evening((64, 128)), torch.ones(64, 128, 3), 7 * evening((64, 128)).roll(9, 1)])
 def test_white_paper_on_open_ground_is_as_bright_under_every_sky(sky):
-    free = look(Fields(SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01), *fields_rest()), width=8)
+    free = look(SolvedScene(SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01), *fields_rest()), width=8)
     sky = exposed(sky)
     white = environment(free, sky) / free.albedo
     assert torch.allclose(white, ground_light(sky).expand_as(white), rtol=0.02)
@@ -203,7 +203,7 @@ SHARP = Material((1.0, 1.0, 1.0), (0.1, 0.1, 0.1), 0.15)
 
 @pytest.mark.parametrize("material", [GLOSSY, SHARP, MATERIALS["gold"]])
 def test_in_a_white_furnace_a_surface_shows_what_it_reflects_and_never_more_than_all(material):
-    empty = Fields(SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01), *fields_rest())
+    empty = SolvedScene(SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01), *fields_rest())
     furnace = everywhere(look(empty, width=8), material)
     picture = environment(furnace, torch.ones(16, 32, 3))
     cosine = (furnace.eye - furnace.maps.points)[..., 2] / (furnace.eye - furnace.maps.points).norm(dim=-1)

@@ -14,7 +14,7 @@ from capture.errors import UserError
 from capture.files.atomic import atomic_file, write_json
 from reconstruct.run_folder.folder import RunFolder, content_hash, read_log
 from reconstruct.run_folder.once import ResultFile, once
-from reconstruct.run_folder.progress import told
+from reconstruct.run_folder.progress import log_to
 
 
 def test_a_file_whose_writing_fails_keeps_its_old_content_and_leaves_nothing_beside_it(tmp_path):
@@ -197,7 +197,7 @@ def test_a_stage_is_done_once_and_again_only_when_its_result_was_removed(tmp_pat
 
 def test_steps_that_a_package_logs_are_said_while_they_last_and_by_their_own_thread_alone():
     logger, said = logging.getLogger("calibration.flashlight.some"), []
-    with told("calibration", said.append):
+    with log_to("calibration", said.append):
         logger.info("placing lights, %d of %d", 1, 2)
         other = threading.Thread(target=logger.info, args=("of another run",))
         other.start()

@@ -30,7 +30,7 @@ def test_a_result_gives_mesh_maps_calibration_and_report(folder):
     assert result.warnings == ["The lights cover only half of the sky; the far side is a guess."]
     assert "faces" in repr(result)
     assert repr(result.calibration) == "Calibration(160 x 120 px, 11 of 12 lights used, unit 'mm')"
-    assert re.fullmatch(r"Fields\(\d+ x \d+ x \d+ nodes of [\d.]+ mm, matt\)", repr(result.fields))
+    assert re.fullmatch(r"SolvedScene\(\d+ x \d+ x \d+ nodes of [\d.]+ mm, matt\)", repr(result.fields))
 
 
 def test_a_notebook_shows_a_card_in_which_names_are_only_text(folder):

@@ -11,7 +11,7 @@ from calibration.lights.shiny_ball import Ball
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError, CaptureError
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.run.ball_on_ground import without_ball
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.source.calibrate_source import calibrate_source
@@ -91,7 +91,7 @@ def test_on_a_known_ground_the_ball_is_cut_from_the_surface():
     ball = np.linalg.norm(nodes - [10.0, 0, 5], axis=-1) - 5
     cube = np.abs(nodes - [-10.0, 0, 4]).max(-1) - 4
     grid = SdfGrid(torch.from_numpy(np.minimum(ball, cube)).float(), torch.tensor([-20.0, -20, -2]), 1.0)
-    fields = Fields(grid, torch.zeros(100, 100, 3), camera, posed.world_from_camera, 0.0, "scene")
+    fields = SolvedScene(grid, torch.zeros(100, 100, 3), camera, posed.world_from_camera, 0.0, "scene")
     left = without_ball(fields, (59.5, 49.5, 1.1 * 5), posed).grid
     assert float(left.sdf(torch.tensor([[10.0, 0, 5]]))) > 4 and float(left.sdf(torch.tensor([[10.0, 0, 9.5]]))) > 0
     assert float(left.sdf(torch.tensor([[-10.0, 0, 4]]))) < -3

@@ -18,7 +18,7 @@ from viewer.stage.parts import StageParts
 
 @pytest.fixture(scope="module", params=list(SHAPES))
 def scene(request):
-    """Fields, mesh, its vertices and normals, its soft light."""
+    """SolvedScene, mesh, its vertices and normals, its soft light."""
     fields = fields_of(truth_of(request.param))
     mesh = mesh_of(fields)
     normals = torch.from_numpy(np.array(mesh.vertex_normals)).float()

@@ -13,7 +13,7 @@ from calibration.camera import Camera
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from reconstruct.config import FitConfig, Level
-from reconstruct.fields import Fields, load_fields, save_fields
+from reconstruct.fields import SolvedScene, load_fields, save_fields
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
@@ -59,7 +59,7 @@ def views() -> tuple[tuple[Scene, ...], tuple[Truth, ...]]:
 
 
 @pytest.fixture(scope="module")
-def solved(views) -> Fields:
+def solved(views) -> SolvedScene:
     return fit(views[0], QUICK, lambda **_: None)
 
 
@@ -87,7 +87,7 @@ def test_several_views_find_the_side_that_one_does_not_see(views, solved):
     assert error(solved.grid, before) < 1.1 * error(alone.grid, before)  # views more never make it worse
 
 
-def exact_views(gains: tuple[tuple[float, float, float], ...]) -> list[Fields]:
+def exact_views(gains: tuple[tuple[float, float, float], ...]) -> list[SolvedScene]:
     """The true surface and the true, patterned albedo as three cameras see it, each in a scale of its own."""
     axes = [np.arange(lower, upper, 1.5) for lower, upper in ((-38, 38), (-38, 38), (-6, 82))]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
@@ -99,7 +99,7 @@ def exact_views(gains: tuple[tuple[float, float, float], ...]) -> list[Fields]:
         grid = SdfGrid(torch.from_numpy(away).float(), torch.from_numpy(nodes[0, 0, 0]).float(), 1.5)
         albedo = torch.from_numpy(truth.albedo * np.array(gain)).float()
         place = (scene.camera, scene.world_from_camera, 0.0, "mm")
-        found.append(Fields(grid, albedo, *place, view=f"view_{number}"))
+        found.append(SolvedScene(grid, albedo, *place, view=f"view_{number}"))
     return found
 
 

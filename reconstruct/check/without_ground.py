@@ -21,7 +21,7 @@ from reconstruct.check.readiness import (
     judge_photos,
     verdict_of,
 )
-from reconstruct.labels.ground_test import no_ground
+from reconstruct.labels.ground_test import empty_ground_test
 from reconstruct.labels.highlights import material_without_ground
 from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.scene import Scene, ground_points
@@ -44,7 +44,7 @@ def judge_without_ground(
     """
     assert scene.rgb is not None
     points = torch.nan_to_num(ground_points(scene), nan=0.0)
-    mask = no_ground(scene).mask
+    mask = empty_ground_test(scene).mask
     cover = _nothing_but_the_object(scene, mask > 0.5, points)
     say = Judge([(GRADES.index("fair"), str(one), "") for one in calibration.residuals.get("warnings", [])])
     facts = capture_facts(calibration, findings, cover) | _shading_facts(scene, points, mask, calibration, cover)

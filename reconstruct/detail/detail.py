@@ -21,7 +21,7 @@ from reconstruct.detail.file import SURE, UNIT, Detail
 from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail
 from reconstruct.detail.full_photos import BYTES_PER_SAMPLE, CHANNELS, FullPhotos, PixelFile, colours_of
 from reconstruct.detail.surface import LitMap, SeenSurface, find_lit, merged, see_surface
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.labels.field_ground_test import label_ground
 from reconstruct.labels.photometric_stereo import ground_light, with_free_powers
 from reconstruct.render.g_buffer import surface_maps
@@ -47,7 +47,7 @@ class Illumination:
     noise: Noise
 
 
-def estimate_illumination(scene: Scene, fields: Fields) -> Illumination:
+def estimate_illumination(scene: Scene, fields: SolvedScene) -> Illumination:
     """Estimate the photos' noise, and the indirect light from ground and object that the solve's albedo assumes.
 
     Args:
@@ -79,7 +79,12 @@ def needed_sentence(pixels: int, photos: int, photo_pixels: int) -> str:
 
 
 def solve_detail(
-    illumination: Illumination, fields: Fields, camera: Camera, files: FullPhotos, folder: Path, on_progress: OnProgress
+    illumination: Illumination,
+    fields: SolvedScene,
+    camera: Camera,
+    files: FullPhotos,
+    folder: Path,
+    on_progress: OnProgress,
 ) -> Detail | None:
     """Solve for the detail of a surface; None if no pixel sees it.
 
@@ -112,7 +117,7 @@ class _Blocks:
     """Iterates over blocks of pixels with their samples and materials."""
 
     illumination: Illumination
-    fields: Fields
+    fields: SolvedScene
     camera: Camera
     seen: SeenSurface
     lit: LitMap

@@ -23,7 +23,7 @@ from capture.files.regular import why
 from capture.files.schema import as_type
 from capture.session.capture import MOST_VIEWS
 from reconstruct.detail.surface import Window
-from reconstruct.fields import BRIGHTEST, MOST_NUMBERS, Fields
+from reconstruct.fields import BRIGHTEST, MOST_NUMBERS, SolvedScene
 from reconstruct.solve.checkpoint import CHECKSUM, FORMAT, checksum, read_whole
 from reconstruct.tensor_file import Layout, parsed, refuse_outside, write_tensors
 
@@ -52,12 +52,12 @@ class Detail:
     """Normals, albedo and confidence of the object's pixels in a window of one view's photos. The view's world."""
 
     normals: Int16[np.ndarray, "height width 3"]  # unit normal times UNIT; 0 where no object is seen
-    albedo: Float16[np.ndarray, "height width 3"]  # linear, as Fields.albedo
+    albedo: Float16[np.ndarray, "height width 3"]  # linear, as SolvedScene.albedo
     confidence: UInt8[np.ndarray, "height width"]  # SURE: well seen; 0: nothing better than the surface is known
     posed_camera: PosedCamera  # of the window
     window: Window  # in the photos
-    view: int = 0  # of Fields.views()
-    object_from_world: Pose | None = None  # of a view of another lie, see Fields.views; None: the world of the others
+    view: int = 0  # of SolvedScene.views()
+    object_from_world: Pose | None = None  # of another lie's view, see SolvedScene.views; None: the world of the others
 
     def in_world(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return points of the frame that all views share in the world of this one."""
@@ -85,12 +85,12 @@ class Detail:
         )
 
 
-def surface_id(fields: Fields) -> str:
+def surface_id(fields: SolvedScene) -> str:
     """Return an identifier of a surface."""
     return hashlib.sha256(fields.grid.values.contiguous().numpy().tobytes()).hexdigest()
 
 
-def save_details(details: Sequence[Detail], fields: Fields, path: Path) -> None:
+def save_details(details: Sequence[Detail], fields: SolvedScene, path: Path) -> None:
     """Write the details of a surface as safetensors with a checksum, whole or not at all.
 
     Args:
@@ -122,7 +122,7 @@ class _Header(Struct):
     window: Window
 
 
-def load_details(path: Path, fields: Fields) -> tuple[Detail, ...]:
+def load_details(path: Path, fields: SolvedScene) -> tuple[Detail, ...]:
     """Read the details of a surface from a file, which may be a stranger's; none if there are none for this surface.
 
     Raises:
@@ -152,7 +152,7 @@ def load_details(path: Path, fields: Fields) -> tuple[Detail, ...]:
     return tuple(found)
 
 
-def _checked(tensors: Mapping[str, Tensor], rest: _Header, fields: Fields, view: int) -> Detail:
+def _checked(tensors: Mapping[str, Tensor], rest: _Header, fields: SolvedScene, view: int) -> Detail:
     """Return one view's detail in a file.
 
     Raises:

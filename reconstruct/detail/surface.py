@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from calibration.camera import Camera
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import RAYS_PER_BLOCK, surface_maps
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import shadow_starts, unshadowed
@@ -77,7 +77,7 @@ class LitMap:
         return torch.from_numpy(self.lit[:, row // self.stride, column // self.stride].T.astype(bool))
 
 
-def see_surface(fields: Fields, camera: Camera) -> SeenSurface | None:
+def see_surface(fields: SolvedScene, camera: Camera) -> SeenSurface | None:
     """Return points and normals of all photo pixels that see the object; None if none does.
 
     Args:
@@ -114,7 +114,7 @@ def _picture(
     return out.reshape(window.height, window.width)
 
 
-def _around_object(fields: Fields, camera: Camera) -> Window | None:
+def _around_object(fields: SolvedScene, camera: Camera) -> Window | None:
     """Return the window of the photos that can show the object."""
     small = fields.camera
     mask = surface_maps(fields.grid, fields.posed_camera).mask

@@ -19,7 +19,7 @@ from calibration.posed_camera import PosedCamera
 from capture.errors import ReconstructionError
 from capture.files.names import stored_file
 from capture.photos.photo import read_photo
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.stored_run.stored_run import StoredRun
 
 UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")  # in file names of lists that are split at spaces, or on other systems
@@ -35,7 +35,7 @@ class Dataset:
     camera: Camera  # of the pictures
     photos: tuple[Path, ...] | None  # the capture's; None: the surface is relit
     calibration: Calibration  # of the view
-    fields: Fields  # as the view saw them, in the world of its lie
+    fields: SolvedScene  # as the view saw them, in the world of its lie
     view: str = ""
     further: tuple["Dataset", ...] = ()  # of the other views, where there are several
 
@@ -89,7 +89,7 @@ def open_dataset(run: StoredRun, photos: Path | None = None) -> Dataset:
     return replace(first, further=tuple(further))
 
 
-def _of_view(run: StoredRun, photos: Path | None, view: str, calibration: Calibration, fields: Fields) -> Dataset:
+def _of_view(run: StoredRun, photos: Path | None, view: str, calibration: Calibration, fields: SolvedScene) -> Dataset:
     used = [light for light in calibration.lights if light.used]
     if not used:
         raise ReconstructionError(

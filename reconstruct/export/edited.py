@@ -11,7 +11,7 @@ import trimesh
 from scipy.spatial import KDTree
 
 from reconstruct.detail.file import Detail
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.mesh.edit import Edit, edited_fields, edited_mesh, without_guess
 from reconstruct.mesh.simplify import simplified
 from reconstruct.stored_run.stage_document import read_stage_document
@@ -25,10 +25,10 @@ class EditedSurface:
     run: StoredRun
     mesh: trimesh.Trimesh  # closed; what is a guess is still there
     edit: Edit
-    edited: Fields | None = None  # None: those of the run
+    edited: SolvedScene | None = None  # None: those of the run
 
     @property
-    def fields(self) -> Fields:
+    def fields(self) -> SolvedScene:
         """The solved scene with the same edits."""
         return self.run.fields if self.edited is None else self.edited
 

@@ -14,7 +14,7 @@ from calibration.light import Light
 from calibration.posed_camera import PosedCamera
 from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.export.stage_scene import GROUND_HALF, StageScene
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import RenderView, SurfaceMaps, surface_maps
 from reconstruct.render.receivers import Receivers
 from reconstruct.render.relight import relight_soft
@@ -36,7 +36,7 @@ RAYS = 3  # shadow rays per pixel of a picture that stands for a moment
 class FirstView:
     """What a camera at the capture camera's centre sees of a scene. Its albedo is the photo's own."""
 
-    def __init__(self, fields: Fields, place: PosedCamera, studio: Studio, scene: StageScene):
+    def __init__(self, fields: SolvedScene, place: PosedCamera, studio: Studio, scene: StageScene):
         """Take where it is seen from."""
         self._fields, self._place, self._studio, self._scene = fields, place, studio, scene
 

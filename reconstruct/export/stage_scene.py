@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from capture.photos.photo import encode_srgb
 from reconstruct.detail.file import SURE, UNIT, Detail
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.mesh.evidence import SEEN
 from reconstruct.mesh.mesh import vertex_colours
 from reconstruct.mesh.simplify import simplified
@@ -37,7 +37,7 @@ class StageScene:
     normals: Float[np.ndarray, "n 3"]  # unit, of the solved surface
     colours: UInt8[np.ndarray, "n 3"]
     evidence: UInt8[np.ndarray, " n"]  # as in reconstruct/mesh/evidence.py; SEEN everywhere where a run states none
-    gloss: UInt8[np.ndarray, "n materials"]  # weights of Fields.gloss over `gloss_scale`, times FULL_WEIGHT
+    gloss: UInt8[np.ndarray, "n materials"]  # weights of SolvedScene.gloss over `gloss_scale`, times FULL_WEIGHT
     gloss_scale: float
     faces: UInt32[np.ndarray, "m 3"]
     object_picture: UInt8[np.ndarray, "height width 3"]  # grown beyond the object's outline, so that it may be sampled
@@ -110,7 +110,7 @@ def filled(values: Float[np.ndarray, "height width 3"], known: Bool[np.ndarray, 
     return out
 
 
-def _normals(fields: Fields, mesh: trimesh.Trimesh) -> Float[np.ndarray, "n 3"]:
+def _normals(fields: SolvedScene, mesh: trimesh.Trimesh) -> Float[np.ndarray, "n 3"]:
     """Return the surface's normals at the vertices; the mesh's own where the base is cut or the slope is not known."""
     own = np.asarray(mesh.vertex_normals, np.float64)
     points = torch.from_numpy(np.asarray(mesh.vertices)).float()
@@ -120,7 +120,7 @@ def _normals(fields: Fields, mesh: trimesh.Trimesh) -> Float[np.ndarray, "n 3"]:
 
 
 def _gloss(
-    fields: Fields, vertices: Float[np.ndarray, "n 3"], material: SeenMaterial
+    fields: SolvedScene, vertices: Float[np.ndarray, "n 3"], material: SeenMaterial
 ) -> tuple[UInt8[np.ndarray, "n materials"], float]:
     if fields.gloss is None:
         return np.zeros((len(vertices), 0), np.uint8), 1.0
@@ -131,7 +131,7 @@ def _gloss(
 
 
 def _object_pictures(
-    fields: Fields, mask: Bool[np.ndarray, "height width"], detail: Detail | None
+    fields: SolvedScene, mask: Bool[np.ndarray, "height width"], detail: Detail | None
 ) -> tuple[np.ndarray, tuple[float, float, float, float], np.ndarray | None]:
     """Return albedo, its window in the photo, and normals where there is a detail."""
     height, width = mask.shape

@@ -37,7 +37,7 @@ from torch import Tensor
 
 from reconstruct.config import FitConfig
 from reconstruct.hull.follow_normals import Integrate, SomePixels, follow_normals, normals_bias, some_pixels
-from reconstruct.hull.hull_matter import matter_of_hull
+from reconstruct.hull.hull_matter import hull_occupancy
 from reconstruct.hull.hull_parts import without_specks
 from reconstruct.hull.normal_integration import LIKELY, integrate_behind, integrate_normals, integrate_within, likeness
 from reconstruct.labels.held_out import draw_blocks, hold_out
@@ -203,7 +203,7 @@ class BentHull:
 class _Within:
     """Bends a hull, always as it was carved, to the integral of the labels' normals behind it.
 
-    From the second time on the hull's matter is kept where rays tell that it is there, see `matter_of_hull`.
+    From the second time on the hull's matter is kept where rays tell that it is there, see `hull_occupancy`.
     """
 
     def __init__(self, hull: SdfGrid, scene: Scene, seen: Seen):
@@ -228,7 +228,7 @@ class _Within:
             return self._behind
         step = -(-self._scene.camera.width // hull.shape[1])
         alike = likeness(own, normals, trust)
-        matter = matter_of_hull(self._hull, self._scene, labels, self._behind, step, alike)
+        matter = hull_occupancy(self._hull, self._scene, labels, self._behind, step, alike)
         t = integrate_within(rays, hull, own, normals, trust, self._behind, matter)
         self._behind = np.where(matter > LIKELY, self._behind, t)
         return t

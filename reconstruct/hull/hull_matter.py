@@ -58,7 +58,7 @@ class _Met:
     pieces: Int[np.ndarray, " pairs"]  # index of the pixel
 
 
-def matter_of_hull(
+def hull_occupancy(
     hull: SdfGrid,
     scene: Scene,
     labels: Labels,

@@ -93,7 +93,7 @@ def integrate_within(
         hull: t of the hull; nan where there is none.
         own: its normals, which are used where the given ones are not trusted.
         behind: t that was solved for before.
-        matter: belief that the hull's matter in front of that is there, see `matter_of_hull`. Where it is likely, the
+        matter: belief that the hull's matter in front of that is there, see `hull_occupancy`. Where it is likely, the
             hull is the surface; pairs begin with the breaks between it and `behind`.
     """
     where = np.isfinite(hull)

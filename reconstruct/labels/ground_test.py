@@ -387,7 +387,7 @@ def _albedo(
     return torch.einsum("khw,khwc->hwc", lit, scene.rgb) / expected.clamp(min=1e-12)
 
 
-def no_ground(scene: Scene) -> GroundTest:
+def empty_ground_test(scene: Scene) -> GroundTest:
     """A ground test that finds no ground: the object is scene.mask, or what is bright before a dark background, or all
     of the picture. Nothing is known of light that comes from below."""
     assert scene.rgb is not None

@@ -59,7 +59,7 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
-class HeldOuts:
+class ValidationRays:
     """The held-out labels of several views; photos are numbered through."""
 
     parts: tuple[HeldOut, ...]

@@ -11,9 +11,9 @@ from torch.nn.functional import normalize
 
 from reconstruct.appearance.brdf import Gloss
 from reconstruct.appearance.lobe_fit import Indirect, from_endless_ground
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.labels.field_ground_test import label_ground
-from reconstruct.labels.ground_test import GroundTest, no_ground, test_ground, tests_alike
+from reconstruct.labels.ground_test import GroundTest, empty_ground_test, test_ground, tests_alike
 from reconstruct.labels.highlights import (
     lit_pixels,
     material_without_ground,
@@ -37,7 +37,7 @@ from reconstruct.sdf.rays import first_hits
 
 
 def _tested(scene: Scene, before: GroundTest | None = None) -> GroundTest:
-    return label_ground(scene, before) if scene.ground_known else no_ground(scene)
+    return label_ground(scene, before) if scene.ground_known else empty_ground_test(scene)
 
 
 def _with_outline(labels: Labels, outline: Outline) -> Labels:
@@ -139,7 +139,7 @@ class Observer:
         material = material_without_ground(scene, points, on_object)
         return scene if material is None else with_powers(scene, material)
 
-    def fields(self, surface: SdfGrid, scene: Scene) -> Fields:
+    def fields(self, surface: SdfGrid, scene: Scene) -> SolvedScene:
         """Return the solved scene: the surface, the material estimated on it, and the current lights.
 
         All in the scene's world, and so is the surface of another lie.
@@ -160,7 +160,7 @@ class Observer:
             first = replace(first, albedo=albedo, gloss=gloss, interreflection=scale)
         return replace(first, albedo=with_lit_ground(scene, self._ground, surface, points, normals, first.albedo))
 
-    def _between_surfaces(self, solved: Fields, scene: Scene) -> tuple[float, Indirect | None]:
+    def _between_surfaces(self, solved: SolvedScene, scene: Scene) -> tuple[float, Indirect | None]:
         """Return the true scale of the albedo, and the light between surfaces; 0 and None where none shows."""
         interreflection = photo_interreflection(solved, scene) if self._relief is None else None
         scale = 0.0 if interreflection is None else true_scale(solved, scene, interreflection)
@@ -170,12 +170,12 @@ class Observer:
 
     def _solved(
         self, surface: SdfGrid, scene: Scene, albedo: Float[Tensor, "height width 3"], gloss: Gloss | None
-    ) -> Fields:
+    ) -> SolvedScene:
         surface = surface if self._relief is None else cut_at_relief(surface, self._relief)
         camera = (scene.camera, scene.world_from_camera)
         rest = (scene.ground_height, scene.unit, scene.lights, gloss)
         middle = surface.origin.double().numpy() + 0.5 * surface.spacing * (np.array(surface.values.shape) - 1)
-        return Fields(
+        return SolvedScene(
             surface,
             albedo,
             *camera,

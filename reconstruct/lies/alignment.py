@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.lies.noise import mean_difference
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.sdf.grid import SdfGrid
@@ -109,7 +109,7 @@ class Alignment:
     by_colour: bool  # colour decided between motions that fit equally well
 
 
-def seen_surface(name: str, fields: Fields) -> SeenSurface:
+def seen_surface(name: str, fields: SolvedScene) -> SeenSurface:
     """Return what the cameras of a lie saw of its surface.
 
     Raises:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool
 
 from calibration.pose import Pose
-from reconstruct.labels.held_out import HeldOuts, draw_blocks, hold_out
+from reconstruct.labels.held_out import ValidationRays, draw_blocks, hold_out
 from reconstruct.labels.supervision import placed_rays
 from reconstruct.lies.alignment import SeenSurface, seen_surface
 from reconstruct.lies.motion_refine import LieRays
@@ -136,12 +136,12 @@ def _sentence(torn: Met, first: Met) -> str:
     )
 
 
-def _held_out(rays: LieRays, scenes: Scenes, seed: int) -> HeldOuts:
+def _held_out(rays: LieRays, scenes: Scenes, seed: int) -> ValidationRays:
     """Return the rays that `withheld` leaves out, in the frame in which the scenes are placed."""
     parts = []
     for number, (scene, own) in enumerate(zip(scenes, rays.rays, strict=True)):
         parts.append(hold_out(placed_rays(own, scene), _drawn(scene, number, seed)[:, own.pixels])[1])
-    return HeldOuts(tuple(parts), tuple(first_photos(scenes)))
+    return ValidationRays(tuple(parts), tuple(first_photos(scenes)))
 
 
 def _drawn(scene: Scene, number: int, seed: int) -> Bool[np.ndarray, "photos pixels"]:

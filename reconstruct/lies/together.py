@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.labels.held_out import hold_out
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import Supervision, supervise
@@ -77,7 +77,7 @@ class SolvedLie:
 
     name: str  # "" for the first: its world is that of the result
     scenes: Scenes
-    fields: Fields
+    fields: SolvedScene
 
     @cached_property
     def rays(self) -> LieRays:

@@ -1,6 +1,6 @@
 """Triangle meshes of a solved scene.
 
-Comes in: Fields.
+Comes in: SolvedScene.
 Goes out: a closed triangle mesh in the world frame with evidence for each vertex, its textures, and PLY, GLB and USD
     files.
 """

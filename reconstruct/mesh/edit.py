@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from trimesh.visual import ColorVisuals
 
 from capture.errors import ReconstructionError
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.mesh.mesh import MAX_NODES, seen_points, surface_mesh, vertex_colours
 from reconstruct.sdf.grid import SdfGrid
 
@@ -30,7 +30,7 @@ class Edit:
     cuts_guess: bool = False
 
 
-def edited_fields(fields: Fields, edit: Edit) -> Fields:
+def edited_fields(fields: SolvedScene, edit: Edit) -> SolvedScene:
     """Return the scene with a smoothed and cropped signed distance.
 
     Smoothing convolves the distance with a Gaussian of standard deviation radius / 2: a relief of wavelength w on a
@@ -48,7 +48,7 @@ def edited_fields(fields: Fields, edit: Edit) -> Fields:
     return replace(fields, grid=SdfGrid(torch.from_numpy(np.ascontiguousarray(values)), grid.origin, grid.spacing))
 
 
-def edited_mesh(fields: Fields, mesh: trimesh.Trimesh, edit: Edit) -> trimesh.Trimesh:
+def edited_mesh(fields: SolvedScene, mesh: trimesh.Trimesh, edit: Edit) -> trimesh.Trimesh:
     """Return the closed surface of edited fields; colours, evidence and sigma are those of the solved mesh nearby.
 
     Args:

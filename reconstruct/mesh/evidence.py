@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import in_cells
 from reconstruct.sdf.rays import in_line_of_sight
 from reconstruct.solve.ray_counts import FEWEST_RAYS
@@ -38,7 +38,7 @@ class VertexEvidence:
     lean: Float[np.ndarray, " n"]  # the part of sigma that all vertices share: what lights do that are off together
 
 
-def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> VertexEvidence | None:
+def vertex_evidence(fields: SolvedScene, vertices: Float[np.ndarray, "n 3"]) -> VertexEvidence | None:
     """Return the evidence for each vertex of a solved scene's surface; None if the solve stored no ray counts.
 
     sigma^2 = f^2 (0.1^2 + (0.3 exp(-B / R))^2 + (1.3 exp(-h / R))^2) + (0.25 D)^2 + (0.8 c s h)^2 with
@@ -47,7 +47,7 @@ def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Verte
     B: the distance to the nearest vertex that nothing constrains; h: the height above the ground
     R: a tenth of the object's diagonal
     D: the distance to the nearest vertex that a camera sees or shadows constrain
-    s: one sigma of a light's place over its distance (`Fields.light_share`)
+    s: one sigma of a light's place over its distance (`SolvedScene.light_share`)
     c: |cosine| between the normal and the line of sight, at least 0.5, where a camera sees the vertex; elsewhere 0.5
 
     The last term, `lean`, is what lights do that are off together, which calibrated ones mostly are: an object sheared
@@ -141,6 +141,6 @@ def _distance_by_cells(
     return _distance_to(is_chosen, means, farthest)[cell]
 
 
-def _in_picture(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+def _in_picture(fields: SolvedScene, vertices: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     u, v = fields.posed_camera.project(vertices).T
     return (np.abs(u / (fields.camera.width - 1) - 0.5) <= 0.5) & (np.abs(v / (fields.camera.height - 1) - 0.5) <= 0.5)

@@ -15,7 +15,7 @@ from capture.errors import ReconstructionError, Remedy
 from capture.files.atomic import atomic_file
 from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.appearance.brdf import MetalRough, metal_rough
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.mesh.evidence import vertex_evidence
 from reconstruct.mesh.facets import faced, flipped
 from reconstruct.mesh.glb import write_glb
@@ -34,7 +34,7 @@ Seen = Callable[[], Sequence[Float[np.ndarray, "_ 3"]]]  # where each view's ray
 Axes = tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"], Float[np.ndarray, " _"]]  # voxels; z from the ground
 
 
-def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
+def extract_mesh(fields: SolvedScene, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
     """Return the object's surface above the ground, world frame: closed, outward, with normals and sRGB albedo.
 
     If the solve stored its ray counts, `vertex_attributes` has `evidence` and `sigma` (reconstruct.mesh.evidence).
@@ -53,7 +53,7 @@ def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
     return mesh
 
 
-def seen_points(fields: Fields) -> list[Float[np.ndarray, "_ 3"]]:
+def seen_points(fields: SolvedScene) -> list[Float[np.ndarray, "_ 3"]]:
     """Return where the rays of each view's pixels meet the object first, in the frame that all views share."""
     maps = [(view, surface_maps(view.grid, view.posed_camera)) for view in fields.views()]
     return [view.in_common(own.points[own.mask].double().numpy()) for view, own in maps]
@@ -211,7 +211,7 @@ def vertex_colours(mesh: trimesh.Trimesh) -> UInt8[np.ndarray, "n 3"]:
     return np.asarray(visual.vertex_colors)[:, :3]
 
 
-def mesh_material(fields: Fields, mesh: trimesh.Trimesh) -> MetalRough | None:
+def mesh_material(fields: SolvedScene, mesh: trimesh.Trimesh) -> MetalRough | None:
     """Return the mesh's glTF material with a colour per vertex; None if no gloss was found."""
     if fields.gloss is None:
         return None

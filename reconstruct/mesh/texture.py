@@ -23,7 +23,7 @@ from capture.photos.photo import encode_srgb
 from reconstruct.appearance.brdf import MetalRough
 from reconstruct.detail.file import Detail
 from reconstruct.detail.fit import DetailSample, detail_at
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.mesh.mesh import mesh_material
 from reconstruct.render.g_buffer import NEIGHBOURS, SAME_POINT, SeenMaterial, albedo_at, seen_material
 
@@ -135,7 +135,7 @@ def pixel_width(detail: Detail, mesh: trimesh.Trimesh) -> float:
 
 
 def bake(
-    fields: Fields, mesh: trimesh.Trimesh, full: trimesh.Trimesh, size: int, details: Sequence[Detail] = ()
+    fields: SolvedScene, mesh: trimesh.Trimesh, full: trimesh.Trimesh, size: int, details: Sequence[Detail] = ()
 ) -> TexturedMesh:
     """Bake colour and normals of the full surface into the textures of a mesh.
 
@@ -234,7 +234,7 @@ def _flat_normals(vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray,
 
 
 def _on_the_cut(
-    fields: Fields, vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray, "m 3"]
+    fields: SolvedScene, vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray, "m 3"]
 ) -> Bool[np.ndarray, " m"]:
     """Return which triangles form the base, where the ground cuts the object: they are level and on the ground."""
     low = (vertices[faces][..., 2] < fields.ground_height + CUT_VOXELS * fields.grid.spacing).all(1)
@@ -251,7 +251,7 @@ def _parted(
 
 
 def _vertex_normals(
-    fields: Fields,
+    fields: SolvedScene,
     vertices: Float[np.ndarray, "n 3"],
     faces: Integer[np.ndarray, "m 3"],
     is_base: Bool[np.ndarray, " m"],
@@ -266,7 +266,10 @@ def _vertex_normals(
 
 
 def _surface(
-    fields: Fields, points: Float[np.ndarray, "n 3"], flat: Float[np.ndarray, "n 3"], is_base: Bool[np.ndarray, " n"]
+    fields: SolvedScene,
+    points: Float[np.ndarray, "n 3"],
+    flat: Float[np.ndarray, "n 3"],
+    is_base: Bool[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Move points onto the zero of the SDF, and return also its unit normals there; the base is unchanged."""
     grid, where = fields.grid, torch.from_numpy(points).float()
@@ -302,7 +305,7 @@ def _in_frame(
 class _SurfaceSampler:
     """Samples colour and normal of the surface at any point."""
 
-    def __init__(self, fields: Fields, full: trimesh.Trimesh, details: Sequence[Detail]):
+    def __init__(self, fields: SolvedScene, full: trimesh.Trimesh, details: Sequence[Detail]):
         """Prepare the data that all points share."""
         self._fields, self._details = fields, details
         self._seen_material: SeenMaterial = seen_material(fields)

@@ -1,5 +1,5 @@
 """Pictures of a solved scene.
 
-Comes in: Fields, a camera, lights or an environment.
+Comes in: SolvedScene, a camera, lights or an environment.
 Goes out: G-buffers, interreflection, relit pictures.
 """

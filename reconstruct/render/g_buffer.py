@@ -13,7 +13,7 @@ from torch import Tensor
 
 from calibration.posed_camera import PosedCamera
 from reconstruct.appearance.brdf import Gloss
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.render.radiosity import Patches, PatchWeights, find_patches, nearest_patches
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import first_hits
@@ -76,7 +76,7 @@ class SeenMaterial:
     object_gloss: Float[np.ndarray, "seen materials"]  # weights of Gloss; no columns where there is none
     ground_points: Float[np.ndarray, "ground 3"]
     ground_albedo: Float[np.ndarray, "ground 3"]
-    fields: Fields  # that it was made of
+    fields: SolvedScene  # that it was made of
 
     @cached_property
     def object_tree(self) -> KDTree:
@@ -186,7 +186,7 @@ def _seen_along(
     return t / stretch, normals, mask, points
 
 
-def seen_material(fields: Fields) -> SeenMaterial:
+def seen_material(fields: SolvedScene) -> SeenMaterial:
     """Return the reliable part of the albedo that every camera saw as world points.
 
     A pixel on the outline mixes object and ground, so one pixel is left out on both sides; not where the object stands
@@ -198,7 +198,7 @@ def seen_material(fields: Fields) -> SeenMaterial:
     return SeenMaterial(*(np.concatenate([getattr(part, name) for part in parts]) for name in names), fields)
 
 
-def _seen_by_one(fields: Fields) -> SeenMaterial:
+def _seen_by_one(fields: SolvedScene) -> SeenMaterial:
     """Return the material that the first camera saw."""
     maps = surface_maps(fields.grid, fields.posed_camera)
     mask, albedo = maps.mask.numpy(), fields.albedo.numpy()
@@ -246,7 +246,7 @@ def finite(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "heigh
 
 
 def albedo_at(
-    fields: Fields, material: SeenMaterial, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
+    fields: SolvedScene, material: SeenMaterial, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
 ) -> Float[Tensor, "n 3"]:
     """Return the linear albedo of world points on the surface.
 
@@ -266,7 +266,7 @@ def albedo_at(
 
 
 def gloss_at(
-    fields: Fields, material: SeenMaterial, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
+    fields: SolvedScene, material: SeenMaterial, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
 ) -> Float[Tensor, "n materials"]:
     """Return the lobe weights of `fields.gloss` at world points, found as in albedo_at; 0 on the ground."""
     assert fields.gloss is not None
@@ -322,7 +322,7 @@ def _wide(
     return ((weight / weight.sum(1, keepdims=True))[:, :, None] * means.of(values)[index]).sum(1)
 
 
-def _inside_photo(fields: Fields, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+def _inside_photo(fields: SolvedScene, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Find the world points in front of a capture camera and inside its picture."""
     inside = np.zeros(len(points), bool)
     for view in (fields, *(one for one in fields.further if one.object_from_world is None)):
@@ -334,7 +334,7 @@ def _inside_photo(fields: Fields, points: Float[np.ndarray, "n 3"]) -> Bool[np.n
 
 
 def look(
-    fields: Fields,
+    fields: SolvedScene,
     width: int | None = None,
     posed_camera: PosedCamera | None = None,
     material: SeenMaterial | None = None,

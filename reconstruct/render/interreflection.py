@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import SurfaceMaps, albedo_at, seen_material, surface_maps
 from reconstruct.render.radiosity import Patches, find_patches, nearest_patches
 from reconstruct.scene import Scene, irradiance
@@ -26,7 +26,7 @@ TINY = 1e-9
 
 @dataclass(frozen=True)
 class PhotoInterreflection:
-    """Irradiance of all patches by interreflection in each photo, for the albedo in Fields."""
+    """Irradiance of all patches by interreflection in each photo, for the albedo in SolvedScene."""
 
     patches: Patches
     arriving: Float[Tensor, "photos patches 3"]
@@ -37,7 +37,7 @@ class PhotoInterreflection:
         return torch.stack([between.interpolated(interreflection) for interreflection in self.arriving])
 
 
-def photo_interreflection(fields: Fields, scene: Scene) -> PhotoInterreflection | None:
+def photo_interreflection(fields: SolvedScene, scene: Scene) -> PhotoInterreflection | None:
     """Return the interreflection of a solved scene under the lights of its photos; None if there is no surface.
 
     A ground that is only assumed (not scene.ground_known) sends and receives nothing.
@@ -51,7 +51,7 @@ def photo_interreflection(fields: Fields, scene: Scene) -> PhotoInterreflection 
     return PhotoInterreflection(found, torch.stack([found.bounced(albedo, e) for e in strength * share[..., None]]))
 
 
-def true_scale(fields: Fields, scene: Scene, interreflection: PhotoInterreflection) -> float:
+def true_scale(fields: SolvedScene, scene: Scene, interreflection: PhotoInterreflection) -> float:
     """Estimate true albedo / recovered albedo, which lights of unknown power leave undetermined.
 
     Object pixels that no light reaches show albedo * (ambient + scale * interreflection). The result is the scale of
@@ -83,7 +83,7 @@ def _scale_beside_ambient(
 
 
 def _shaded_samples(
-    fields: Fields, scene: Scene, interreflection: PhotoInterreflection
+    fields: SolvedScene, scene: Scene, interreflection: PhotoInterreflection
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"], Float[Tensor, " n"]]:
     """Return samples of the object that no light reaches, grey: seen less ambient, albedo, and what is expected."""
     assert scene.rgb is not None
@@ -98,7 +98,7 @@ def _shaded_samples(
 
 
 def _shaded(
-    fields: Fields, scene: Scene, maps: SurfaceMaps, row: Int[Tensor, " n"], column: Int[Tensor, " n"]
+    fields: SolvedScene, scene: Scene, maps: SurfaceMaps, row: Int[Tensor, " n"], column: Int[Tensor, " n"]
 ) -> Bool[Tensor, "photos n"]:
     """Find the object pixels that no light reaches, in each photo."""
     points, normals = maps.points[row, column], maps.normals[row, column]

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from reconstruct.appearance.brdf import Gloss
-from reconstruct.fields import Fields, FurtherView
+from reconstruct.fields import FurtherView, SolvedScene
 from reconstruct.render.g_buffer import MIN_FACING, SAME_DEPTH, SurfaceMaps, away_from_outlines, finite, surface_maps
 
 FEATHER = 0.06  # of the object's size in the picture: its weight grows so far from the outline, where seams would be
@@ -25,7 +25,7 @@ DARKEST = 1e-3  # albedo below which no ratio is known
 class _View:
     """What one camera saw, and how well: channels are the albedo and the weights of all views' lobes."""
 
-    fields: Fields
+    fields: SolvedScene
     maps: SurfaceMaps  # in the view's world
     points: Float[np.ndarray, "height width 3"]  # of maps, in the frame that all views share
     values: Float[np.ndarray, "height width channels"]
@@ -50,7 +50,7 @@ class _View:
         return values, np.where(seen, weight, 0.0)
 
 
-def join_views(views: Sequence[Fields]) -> Fields:
+def join_views(views: Sequence[SolvedScene]) -> SolvedScene:
     """Return one scene from what each camera saw of one surface.
 
     Each view's albedo has a factor per channel of its own: its photos' exposure and white balance. The factors make
@@ -86,7 +86,7 @@ def join_views(views: Sequence[Fields]) -> Fields:
 
 
 def _common_lobes(
-    views: Sequence[Fields],
+    views: Sequence[SolvedScene],
 ) -> tuple[Float[Tensor, "materials lobes 3"] | None, list[Float[np.ndarray, "height width materials"]]]:
     """Return the lobes of all views as one list, and each view's weights of them."""
     glossy = [view.gloss for view in views if view.gloss is not None]
@@ -101,7 +101,7 @@ def _common_lobes(
     return torch.cat([gloss.lobes for gloss in glossy]) if glossy else None, tables
 
 
-def _view(fields: Fields, gloss: Float[np.ndarray, "height width materials"]) -> _View:
+def _view(fields: SolvedScene, gloss: Float[np.ndarray, "height width materials"]) -> _View:
     maps = surface_maps(fields.grid, fields.posed_camera)
     eye = torch.from_numpy(fields.posed_camera.centre).float()
     towards = torch.nn.functional.normalize(eye - maps.points, dim=-1)

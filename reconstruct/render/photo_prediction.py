@@ -9,7 +9,7 @@ from torch import Tensor
 
 from calibration.calibration import Calibration
 from calibration.light import Light
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import RenderView
 from reconstruct.render.relight import lit_share, relight
 
@@ -29,7 +29,7 @@ def shadow_picture(view: RenderView, calibration: Calibration, photo: str) -> Fl
     return share[..., None].expand(*share.shape, 3)
 
 
-def with_refined_lights(calibration: Calibration, fields: Fields) -> Calibration:
+def with_refined_lights(calibration: Calibration, fields: SolvedScene) -> Calibration:
     """Return the calibration with the lights refined by the solve."""
     used = [i for i, light in enumerate(calibration.lights) if light.used]
     if fields.lights is None or len(used) != len(fields.lights):

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import SeenMaterial, albedo_at
 from reconstruct.render.radiosity import Patches, find_patches, nearest_patches
 from reconstruct.render.receivers import Receivers, across, disc
@@ -54,7 +54,7 @@ class SoftLight:
 
 
 def soft_light(
-    fields: Fields,
+    fields: SolvedScene,
     material: SeenMaterial,
     mesh: trimesh.Trimesh,
     normals: Float[Tensor, "n 3"],
@@ -133,7 +133,7 @@ class _NeighbourMeans:
         return torch.from_numpy(np.ascontiguousarray(flat, np.float32)).reshape(values.shape)
 
 
-def ground_sky(fields: Fields, centre: Float[np.ndarray, "3"], half: float) -> Float[np.ndarray, "side side"]:
+def ground_sky(fields: SolvedScene, centre: Float[np.ndarray, "3"], half: float) -> Float[np.ndarray, "side side"]:
     """Return `sky_share` of the ground on a square around `centre`, world; rows along +y, columns along +x.
 
     Args:
@@ -148,7 +148,7 @@ def ground_sky(fields: Fields, centre: Float[np.ndarray, "3"], half: float) -> F
     return cv2.blur(share, (3, 3))
 
 
-def _patches(fields: Fields, material: SeenMaterial) -> tuple[Patches | None, Float[Tensor, "patches 3"]]:
+def _patches(fields: SolvedScene, material: SeenMaterial) -> tuple[Patches | None, Float[Tensor, "patches 3"]]:
     """Return the scene's patches with the albedo as it was found, where photos did not tell its scale."""
     found = find_patches(fields.grid, fields.ground_height)
     if found is None:

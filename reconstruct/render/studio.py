@@ -10,7 +10,7 @@ from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import RenderView, SeenMaterial, look, seen_material
 from reconstruct.render.relight import relight_soft
 
@@ -39,7 +39,7 @@ def studio_of(bounds: Float[np.ndarray, "2 3"]) -> Studio:
     return Studio(bounds.mean(0), float(np.linalg.norm(np.ptp(bounds, axis=0))) / 2)
 
 
-def around(studio: Studio, fields: Fields, turn: float, width: int) -> PosedCamera:
+def around(studio: Studio, fields: SolvedScene, turn: float, width: int) -> PosedCamera:
     """Return a camera that looks at the object from the capture camera's place turned by `turn` rad about +z.
 
     Args:
@@ -95,7 +95,7 @@ def lit(
 
 
 def turntable(
-    fields: Fields,
+    fields: SolvedScene,
     studio: Studio,
     width: int,
     frames: int,
@@ -112,7 +112,7 @@ def turntable(
 
 
 def light_orbit(
-    fields: Fields, studio: Studio, width: int, frames: int, lamp_size: float | None = None
+    fields: SolvedScene, studio: Studio, width: int, frames: int, lamp_size: float | None = None
 ) -> Iterator[Float[np.ndarray, "height width 3"]]:
     """Yield linear pictures from the capture camera while the lamp orbits the object once."""
     camera = fields.camera

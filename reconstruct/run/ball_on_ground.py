@@ -6,11 +6,11 @@ import numpy as np
 import torch
 
 from calibration.posed_camera import PosedCamera
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.sdf.grid import SdfGrid
 
 
-def without_ball(fields: Fields, circle: tuple[float, float, float], posed_camera: PosedCamera) -> Fields:
+def without_ball(fields: SolvedScene, circle: tuple[float, float, float], posed_camera: PosedCamera) -> SolvedScene:
     """Return the surface without a ball that stands on the ground.
 
     Args:

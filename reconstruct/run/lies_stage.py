@@ -8,7 +8,7 @@ import torch
 
 from capture.errors import ReconstructionError
 from reconstruct.config import FitConfig
-from reconstruct.fields import Fields, load_fields, save_fields
+from reconstruct.fields import SolvedScene, load_fields, save_fields
 from reconstruct.lies.confirmed import confirmed, withheld
 from reconstruct.lies.together import PlacedLie, SolvedLie, Together, lay_together
 from reconstruct.mesh.mesh import extract_mesh
@@ -110,7 +110,7 @@ def _solved_small(
     report: SolveReporter,
     run: RunFolder,
     device: torch.device | None,
-) -> Fields:
+) -> SolvedScene:
     """Return a lie's own solve, from its file if there is one."""
     if path.is_file():
         return load_fields(path)

@@ -7,9 +7,9 @@ Eight functions, in this order. Each depends on its arguments alone; examples/st
     calibrate_source  Photos              -> CalibratedViews: camera, ground, a light per photo, each with its sigma
     check_capture     Photos, Calibration -> CaptureCheck: a verdict; a hopeless capture ends here
     prepare_scene     Photos, Calibration -> a Scene of each view: torch tensors at the preset's size
-    fit               Scenes              -> Fields: signed distances and materials
-    extract_mesh      Fields              -> a closed mesh in the world frame
-    save_results      mesh, Fields        -> files for people and other programs
+    fit               Scenes              -> SolvedScene: signed distances and materials
+    extract_mesh      SolvedScene         -> a closed mesh in the world frame
+    save_results      mesh, SolvedScene   -> files for people and other programs
 
 A capture of one view is a tuple of one.
 
@@ -30,7 +30,7 @@ from capture.photos.photo import read_thumbnail
 from capture.session.session import FEWEST_LIT
 from reconstruct.check.readiness import refuse_hopeless
 from reconstruct.check.verdict import check_capture
-from reconstruct.fields import Fields, load_fields, save_fields
+from reconstruct.fields import SolvedScene, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.run.ball_on_ground import without_ball
 from reconstruct.run.machine import kernels_are_compiled, measure_speed, planned_seconds, whole_seconds, work_of
@@ -41,7 +41,7 @@ from reconstruct.run.solve_stage import solve
 from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder, content_hash
 from reconstruct.run_folder.forecast import duration_text, plan_numbers
 from reconstruct.run_folder.once import Lazy, ResultFile, done_once, once
-from reconstruct.run_folder.progress import told
+from reconstruct.run_folder.progress import log_to
 from reconstruct.solve.backend import backend_name, solver_device
 from reconstruct.source.calibrate_source import calibrate_source, in_millimetres, with_scale_of
 from reconstruct.source.photos import Photos, Plan, keep_spread, memory_plan, read_photos, read_plan
@@ -147,7 +147,7 @@ def _read(source: Source, options: RunOptions, run: RunFolder) -> tuple[Photos, 
 
 def _calibrated(source: Source, photos: Sequence[Photos], options: RunOptions, run: RunFolder) -> CalibratedViews:
     """Stage "calibrate"; small photos are named anew if the first view is left out."""
-    with told("calibration", run.activity):
+    with log_to("calibration", run.activity):
         calibrated = calibrate_source(source, photos, options)
     if len(photos) > 1 and photos[0].view != calibrated.views[0].name:
         write_thumbnails(source, run, calibrated.views[0].name)
@@ -164,7 +164,7 @@ def _check(source: Source, photos: Sequence[Photos], calibrated: CalibratedViews
 
 def _solved(
     source: Source, photos: Lazy[tuple[Photos, ...]], calibrated: CalibratedViews, options: RunOptions, run: RunFolder
-) -> Fields:
+) -> SolvedScene:
     """Stage "solve", see solve_stage; a surface that no visitor stopped gets the given scale."""
     calibrated = _within_memory(source, options, run, calibrated)
     fields, length = solve(source, options, run, photos, calibrated), source.scale(options)
@@ -176,7 +176,7 @@ def _solved(
 
 
 def _keep_scale(
-    source: Source, options: RunOptions, run: RunFolder, calibrated: CalibratedViews, fields: Fields
+    source: Source, options: RunOptions, run: RunFolder, calibrated: CalibratedViews, fields: SolvedScene
 ) -> None:
     """Bring calibration.json to the unit of the solved scene; it is there already if this was done before."""
     length = source.scale(options)

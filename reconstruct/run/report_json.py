@@ -19,7 +19,7 @@ from reconstruct.source.source import RunOptions, Source
 from reconstruct.stored_run.documents import CHECK, read_check
 
 if TYPE_CHECKING:
-    from reconstruct.fields import Fields
+    from reconstruct.fields import SolvedScene
 
 NAMES = ("shadowgraph", "numpy", "torch", "numba", "opencv-contrib-python-headless", "trimesh", "viser")
 MISFIT = 0.1  # of held-out shadow rays: captures with right lights leave .002 to .05
@@ -38,7 +38,7 @@ def summary(
     run: RunFolder,
     calibrated: CalibratedViews,
     mesh: trimesh.Trimesh,
-    solved: "Fields",
+    solved: "SolvedScene",
 ) -> dict[str, Any]:
     """Return the content of report.json: costs, photos used and dropped, residuals, versions."""
     calibration = calibrated.first
@@ -121,7 +121,7 @@ def _said(calibrated: CalibratedViews, key: str) -> list[str]:
     return [*dict.fromkeys(text for view in calibrated.every() for text in view.calibration.residuals.get(key, []))]
 
 
-def _of_views(calibrated: CalibratedViews, solved: "Fields") -> dict[str, Any]:
+def _of_views(calibrated: CalibratedViews, solved: "SolvedScene") -> dict[str, Any]:
     """Return the rows of the single views, where there are several; of another lie, with how it lies in the first."""
     every = calibrated.every()
     if len(every) == 1:
@@ -192,7 +192,7 @@ def _requests(run: RunFolder) -> list[str]:
     return [text for i, text in said if i > last or "goes on from here" not in text]
 
 
-def _refined_lights(calibration: Calibration, solved: "Fields") -> list[dict[str, Any]]:
+def _refined_lights(calibration: Calibration, solved: "SolvedScene") -> list[dict[str, Any]]:
     """Return each uncertain light after the solve, and its distance from its calibrated position or direction.
 
     `moved` is in units of the calibration (radians for a direction); `sigmas` is `moved` over the norm of `sigma`.
@@ -210,7 +210,7 @@ def _refined_lights(calibration: Calibration, solved: "Fields") -> list[dict[str
     return rows
 
 
-def _light_trial(solved: "Fields") -> dict[str, Any] | None:
+def _light_trial(solved: "SolvedScene") -> dict[str, Any] | None:
     """Return if refined lights were kept, and the errors of held-out shadow rays that decided; None if not tried."""
     trial = solved.light_trial
     if trial is None:
@@ -230,7 +230,7 @@ def misfit(numbers: dict[str, float]) -> list[str]:
     ]
 
 
-def pieces(mesh: trimesh.Trimesh, solved: "Fields") -> list[str]:
+def pieces(mesh: trimesh.Trimesh, solved: "SolvedScene") -> list[str]:
     """Return a warning if the mesh falls into pieces that hang in the air; without ground, into pieces at all."""
     parts = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)))
     if len(parts) < 2:
@@ -261,7 +261,7 @@ def guessed(mesh: trimesh.Trimesh) -> list[str]:
     ]
 
 
-def undersides(mesh: trimesh.Trimesh, solved: "Fields") -> list[str]:
+def undersides(mesh: trimesh.Trimesh, solved: "SolvedScene") -> list[str]:
     """Return a warning if a large part of the surface faces the ground and has no evidence; the base does not count.
 
     What the edge of a seat or a table's top shades hangs in shadow under every light, however far it hangs down.

@@ -17,7 +17,7 @@ from capture.files.atomic import atomic_file
 from reconstruct.detail.detail import OnProgress, estimate_illumination, solve_detail
 from reconstruct.detail.file import DETAIL, Detail, save_details
 from reconstruct.detail.full_photos import full_photos
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.labels.multiple_lights import is_shared
 from reconstruct.mesh.mesh import mesh_material, save_mesh
 from reconstruct.render.g_buffer import surface_maps
@@ -45,7 +45,7 @@ def write_detail(
     run: RunFolder,
     photos: Sequence[Photos],
     calibrated: CalibratedViews,
-    fields: Fields,
+    fields: SolvedScene,
 ) -> None:
     """Write detail.safetensors, the detail of each view that has one; log the reason where a view has none.
 
@@ -68,7 +68,7 @@ def write_detail(
         save_details(details, fields, run.file(DETAIL))
 
 
-def _reporter(run: RunFolder, number: int, views: Sequence[Fields]) -> OnProgress:
+def _reporter(run: RunFolder, number: int, views: Sequence[SolvedScene]) -> OnProgress:
     """Return what logs the progress of one of the views, in at most LINES lines for all."""
     lines, of_view = set(), f"{views[number].view}: " if len(views) > 1 else ""
 
@@ -86,7 +86,7 @@ def _of_view(
     options: RunOptions,
     run: RunFolder,
     own: tuple[Photos, Calibration],
-    fields: Fields,
+    fields: SolvedScene,
     report: OnProgress,
 ) -> Detail | None:
     """Return the detail of one view, or None and log why there is none.
@@ -110,7 +110,7 @@ def _of_view(
     return detail
 
 
-def save_results(mesh: trimesh.Trimesh, fields: Fields, calibrated: CalibratedViews, folder: Path) -> None:
+def save_results(mesh: trimesh.Trimesh, fields: SolvedScene, calibrated: CalibratedViews, folder: Path) -> None:
     """Write mesh.ply, mesh.glb, depth.npy, normal.npy and mask.png, each whole or absent; see CONVENTIONS.md.
 
     The maps are those of the first view's camera: depth along its z axis, normals in the world frame. Where there are
@@ -133,7 +133,7 @@ def save_results(mesh: trimesh.Trimesh, fields: Fields, calibrated: CalibratedVi
             save_maps(view, calibrations[view.view], folder / view.view)
 
 
-def save_maps(fields: Fields, calibration: Calibration, folder: Path) -> None:
+def save_maps(fields: SolvedScene, calibration: Calibration, folder: Path) -> None:
     """Write depth.npy, normal.npy and mask.png of one camera, each whole or absent.
 
     Raises:

@@ -14,7 +14,7 @@ from capture.errors import ReconstructionError, Remedy
 from capture.files.atomic import read_json
 from capture.files.regular import why
 from reconstruct.config import FitConfig
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.mesh.mesh import preview_mesh
 from reconstruct.mesh.texture import PhotoColours
 from reconstruct.run.lies_stage import forget_lies, joined_lies
@@ -138,7 +138,7 @@ def prepare_scene(source: Source, photos: Sequence[Photos], calibrated: Calibrat
 
 def solve(
     source: Source, options: RunOptions, run: RunFolder, photos: Lazy[tuple[Photos, ...]], calibrated: CalibratedViews
-) -> Fields:
+) -> SolvedScene:
     """Build the scenes of all views and fit the surface, or train a field; repeat for another chosen resolution.
 
     If a visitor stopped the solve before the end of its schedule, the stage stays open: the same command continues it.

@@ -35,7 +35,7 @@ class _Told(logging.Handler):
 
 
 @contextmanager
-def told(package: str, say: Callable[[str], None]) -> Iterator[None]:
+def log_to(package: str, say: Callable[[str], None]) -> Iterator[None]:
     """Say what a package logs of its steps, as long as this lasts; of this thread alone, as runs may be side by side.
 
     Args:

@@ -1,5 +1,5 @@
 """ShadowNeuS as published: fields that are trained.
 
 Comes in: a Scene and TrainConfig.
-Goes out: Fields, from a network or grid that was trained with the losses of ShadowNeuS.
+Goes out: SolvedScene, from a network or grid that was trained with the losses of ShadowNeuS.
 """

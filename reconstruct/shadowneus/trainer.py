@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from capture.errors import ReconstructionError, Remedy
-from reconstruct.fields import Fields, as_stored
+from reconstruct.fields import SolvedScene, as_stored
 from reconstruct.labels.multiple_lights import is_shared
 from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene
@@ -91,7 +91,7 @@ def train(
     checkpoint: Path | None = None,
     device: torch.device | None = None,
     steering: Steering = NO_STEERING,
-) -> Fields:
+) -> SolvedScene:
     """Reconstruct surface and albedo of a scene by training a field with shadow-ray supervision [ShadowNeuS].
 
     Args:
@@ -196,15 +196,15 @@ def learning_factor(iteration: int, config: TrainConfig) -> float:
     return config.last_learning_rate + (1 - config.last_learning_rate) * 0.5 * (1 + math.cos(math.pi * share))
 
 
-def finished(model: Model, scene: Scene, frame: UnitFrame, config: TrainConfig) -> Fields:
-    """Convert the trained model to Fields: SDF on a grid, albedo per pixel, world frame."""
+def finished(model: Model, scene: Scene, frame: UnitFrame, config: TrainConfig) -> SolvedScene:
+    """Convert the trained model to SolvedScene: SDF on a grid, albedo per pixel, world frame."""
     device = next(model.parameters()).device
     grid = read_onto_grid(model.field, frame, config.mesh_nodes, scene.ground_height, config.bound, device)
     if scene.rgb is None:
         return as_stored(Observer(scene).fields(grid, scene))
     albedo = _albedo(model, make_train_pixels(scene, frame, 1, device), config)
     camera, ground = (scene.camera, scene.world_from_camera), scene.ground_height
-    return as_stored(Fields(grid, albedo, *camera, ground, scene.unit))
+    return as_stored(SolvedScene(grid, albedo, *camera, ground, scene.unit))
 
 
 @torch.no_grad()

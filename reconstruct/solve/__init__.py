@@ -1,6 +1,6 @@
 """The solver.
 
 Comes in: a Scene, FitConfig, and a first surface.
-Goes out: Fields: the surface whose shadows, outline and normals agree with the labels, with lights refined; resumable
-    at any moment.
+Goes out: SolvedScene: the surface whose shadows, outline and normals agree with the labels, with lights refined;
+    resumable at any moment.
 """

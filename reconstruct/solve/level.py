@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from reconstruct.config import FitConfig, Level
-from reconstruct.labels.held_out import HeldOut, HeldOuts
+from reconstruct.labels.held_out import HeldOut, ValidationRays
 from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
 from reconstruct.sdf.level_set import LevelSet
@@ -30,7 +30,7 @@ class LevelFit:
 
     scenes: Scene | Scenes
     rays: Supervision | tuple[Supervision, ...]  # of each scene
-    held_out: HeldOut | HeldOuts  # held-out rays: they may end the level early
+    held_out: HeldOut | ValidationRays  # held-out rays: they may end the level early
     level: Level
     config: FitConfig
     first: int = 0  # iterations of the whole solve before this level; with the seed it determines the rays

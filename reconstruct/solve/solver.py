@@ -11,10 +11,10 @@ import torch
 
 from capture.errors import ReconstructionError, Remedy
 from reconstruct.config import FitConfig, Level
-from reconstruct.fields import Fields, as_stored
+from reconstruct.fields import SolvedScene, as_stored
 from reconstruct.initialization.choose_start import HULL, Start, choose_start
 from reconstruct.initialization.shadow_mask import with_object_mask
-from reconstruct.labels.held_out import HeldOuts, draw_blocks, hold_out
+from reconstruct.labels.held_out import ValidationRays, draw_blocks, hold_out
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import Supervision, normal_rays, placed_rays, restricted, supervise
@@ -60,7 +60,7 @@ def fit(
     device: torch.device | None = None,
     earlier: SolveState | None = None,
     say: Callable[[str], None] = lambda _: None,
-) -> Fields:
+) -> SolvedScene:
     """Fit the surface and albedo that explain the shadows and shading of a scene, or of several views of one object.
 
     1. Every pixel is tested against the known ground. 2. Lit ground carves the shadow hull. 3. On finer and finer
@@ -81,7 +81,7 @@ def fit(
             ground, or no memory on the device.
     """
     solved = fit_steered(scene, config, report, checkpoint, device, NO_STEERING, earlier, say)
-    assert isinstance(solved, Fields)  # nobody asks for another schedule
+    assert isinstance(solved, SolvedScene)  # nobody asks for another schedule
     return solved
 
 
@@ -94,7 +94,7 @@ def fit_steered(
     steering: Steering,
     earlier: SolveState | None = None,
     say: Callable[[str], None] = lambda _: None,
-) -> Fields | Rescheduled:
+) -> SolvedScene | Rescheduled:
     """Fit as `fit` does, while `steering` may pause the solve, end a level or all of it, or change the schedule.
 
     Raises:
@@ -186,7 +186,7 @@ def _solved(
 
 def _fields(
     observers: tuple[Observer, ...], scenes: Scenes, rays: tuple[Supervision, ...], begin: Start, found: SdfGrid
-) -> Fields:
+) -> SolvedScene:
     """Return the solved scene: a surface, its material as all views show it, and the rays that hold it."""
     solved = join_views([observer.fields(found, scene) for observer, scene in zip(observers, scenes, strict=True)])
     evidence = ray_counts(placed(scenes), rays, solved.grid, begin.config)
@@ -367,7 +367,7 @@ def _resumed(
 
 def _held_out(
     scenes: Scenes, rays: tuple[Supervision, ...], config: FitConfig
-) -> tuple[tuple[Supervision, ...], HeldOuts]:
+) -> tuple[tuple[Supervision, ...], ValidationRays]:
     """Return each view's rays of a level without those held out, and these."""
     parts = []
     for number, (scene, own) in enumerate(zip(scenes, rays, strict=True)):
@@ -375,7 +375,7 @@ def _held_out(
         drawn = draw_blocks(own.pixels, scene.camera.width, len(scene.lights), seed)
         parts.append(hold_out(restricted(own, config.supervised), drawn))
     kept, held = zip(*parts, strict=True)
-    return kept, HeldOuts(held, tuple(first_photos(scenes)))
+    return kept, ValidationRays(held, tuple(first_photos(scenes)))
 
 
 class _Timer:

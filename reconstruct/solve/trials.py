@@ -17,7 +17,7 @@ from reconstruct.hull.shadow_hull import shadow_hull
 from reconstruct.initialization.height_field import HeightConfig, fit_heights
 from reconstruct.initialization.height_grid import height_grid
 from reconstruct.initialization.height_view import HeightView, height_view
-from reconstruct.labels.held_out import HeldOut, HeldOuts, draw_blocks, hold_out, without
+from reconstruct.labels.held_out import HeldOut, ValidationRays, draw_blocks, hold_out, without
 from reconstruct.labels.labels import not_isolated
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.outline import wrong_labels
@@ -75,7 +75,7 @@ def try_lights(
     return verdict, sides[int(verdict.is_accepted)]
 
 
-def judge(held_out: HeldOut | HeldOuts, calibrated: np.ndarray, refined: np.ndarray, n_photos: int) -> Verdict:
+def judge(held_out: HeldOut | ValidationRays, calibrated: np.ndarray, refined: np.ndarray, n_photos: int) -> Verdict:
     """Decide from the errors of every held-out ray. Without such rays, or with one photo, nothing is accepted."""
     weight = np.bincount(held_out.photo, held_out.weight, n_photos)
     before, after = (np.bincount(held_out.photo, held_out.weight * e, n_photos) for e in (calibrated, refined))

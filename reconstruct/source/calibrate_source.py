@@ -18,7 +18,7 @@ from calibration.calibration import Calibration
 from calibration.views.calibrate_views import ViewPhotos, calibrate_views
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
 from capture.session.session import FEWEST_LIT
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.source.photos import Photos, keep_spread
 from reconstruct.source.source import RunOptions, Source, ground_option
@@ -27,7 +27,7 @@ UNKNOWN_SCALE = "scale: "  # beginning of the note that the given length replace
 FEWEST_POINTS = 4
 
 
-def in_millimetres(fields: Fields, length: float, ground_is_known: bool) -> Fields:
+def in_millimetres(fields: SolvedScene, length: float, ground_is_known: bool) -> SolvedScene:
     """Scale a solved scene so that the object's height above the ground, or its extent in the picture, is `length`.
 
     Without a known ground, the extent is the largest distance between two visible points of the object, across the
@@ -51,7 +51,7 @@ def in_millimetres(fields: Fields, length: float, ground_is_known: bool) -> Fiel
     return fields.scaled(length / found, "mm")
 
 
-def with_scale_of(calibration: Calibration, fields: Fields, length: float, ground_is_known: bool) -> Calibration:
+def with_scale_of(calibration: Calibration, fields: SolvedScene, length: float, ground_is_known: bool) -> Calibration:
     """Return the calibration in the unit of a scaled scene, whose camera is the same, with a note on the length."""
     factor = _height(fields.world_from_camera.translation, fields.ground_height) / _height(
         calibration.world_from_camera.translation, calibration.ground_height

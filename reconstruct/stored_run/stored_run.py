@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # torch and trimesh take seconds to import, and a page that f
     import trimesh
 
     from reconstruct.detail.file import Detail
-    from reconstruct.fields import Fields
+    from reconstruct.fields import SolvedScene
 
 CALIBRATION, FIELDS, DETAIL, MESH = "calibration.json", "fields.safetensors", "detail.safetensors", "mesh.ply"
 FARTHEST = 1e6  # sizes of the grid from its origin to a light or a vertex: beyond, a float32 knows no voxel any more
@@ -48,7 +48,7 @@ class StoredRun:
         return self.fields.unit
 
     @cached_property
-    def fields(self) -> "Fields":
+    def fields(self) -> "SolvedScene":
         """The solved scene."""
         from reconstruct.fields import load_fields
 
@@ -74,10 +74,10 @@ class StoredRun:
         return found
 
     @cached_property
-    def views(self) -> "tuple[tuple[str, Calibration, Fields], ...]":
+    def views(self) -> "tuple[tuple[str, Calibration, SolvedScene], ...]":
         """Each camera of the solve: the name of its view, its calibration, and the scene as it saw it.
 
-        Those of another lie are in that lie's world; Fields.object_from_world leads to that of the others.
+        Those of another lie are in that lie's world; SolvedScene.object_from_world leads to that of the others.
         """
         first = self.calibration
         stored = {view.name: view.calibration for view in load_views(self.run_dir / CALIBRATION).every()}
@@ -129,7 +129,7 @@ class StoredRun:
         return folder
 
 
-def refuse_elsewhere(calibration: Calibration, fields: "Fields", run_dir: Path) -> None:
+def refuse_elsewhere(calibration: Calibration, fields: "SolvedScene", run_dir: Path) -> None:
     """Check that calibration.json and fields.safetensors are of one scene: its unit, and lights that can reach it.
 
     Raises:
@@ -143,7 +143,7 @@ def refuse_elsewhere(calibration: Calibration, fields: "Fields", run_dir: Path) 
             _refuse_far(light.position[None], fields, f"{run_dir / CALIBRATION}: the light of {light.photo!r:.80}")
 
 
-def refuse_far_mesh(mesh: "trimesh.Trimesh", fields: "Fields", run_dir: Path) -> None:
+def refuse_far_mesh(mesh: "trimesh.Trimesh", fields: "SolvedScene", run_dir: Path) -> None:
     """Check that mesh.ply lies where fields.safetensors does.
 
     Raises:
@@ -152,7 +152,7 @@ def refuse_far_mesh(mesh: "trimesh.Trimesh", fields: "Fields", run_dir: Path) ->
     _refuse_far(np.asarray(mesh.bounds), fields, f"{run_dir / MESH}: the mesh")
 
 
-def _refuse_far(places: np.ndarray, fields: "Fields", what: str) -> None:
+def _refuse_far(places: np.ndarray, fields: "SolvedScene", what: str) -> None:
     size = fields.grid.spacing * max(fields.grid.values.shape)
     away = float(np.abs(places - fields.grid.origin.double().numpy()).max())
     if not away <= FARTHEST * size:

@@ -17,7 +17,7 @@ from calibration.calibration import Calibration
 from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.detail.file import Detail
 from reconstruct.detail.fit import with_detail
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import RenderView, look
 from reconstruct.render.photo_prediction import photographed, shadow_picture, with_refined_lights
 from reconstruct.stored_run.maps import thumbnail_name
@@ -59,7 +59,7 @@ def as_bright_as(linear: Float[np.ndarray, "height width 3"], photo: Picture) ->
 
 
 def compare_result(
-    fields: Fields, calibration: Calibration, name: str, photo: Picture, details: Sequence[Detail] = ()
+    fields: SolvedScene, calibration: Calibration, name: str, photo: Picture, details: Sequence[Detail] = ()
 ) -> Comparison | None:
     """Compare a photo of a finished run, by its name in the calibration, with its computed picture."""
     camera = fields.camera.resized(photo.shape[1], photo.shape[0])
@@ -210,7 +210,7 @@ def maps_part(maps: HasMaps | None, calibration: Calibration | None) -> str:
     )
 
 
-def comparison_part(fields: Fields | None, calibration: Calibration | None, thumbs: Mapping[str, Picture]) -> str:
+def comparison_part(fields: SolvedScene | None, calibration: Calibration | None, thumbs: Mapping[str, Picture]) -> str:
     """Return the part that compares one photo with its computed picture."""
     lights = [] if calibration is None else [x for x in calibration.lights if x.used and Path(x.photo).stem in thumbs]
     if fields is None or calibration is None or not lights:

@@ -18,7 +18,7 @@ from calibration.calibration import Calibration, load_calibration
 from capture.errors import UserError
 from capture.files.atomic import atomic_file
 from capture.files.regular import is_own_folder
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.source.source import RunOptions
 from reconstruct.stored_run.documents import MANIFEST, REPORT
 from reconstruct.stored_run.maps import DEPTH, THUMBS, Maps, read_maps, read_thumbnails
@@ -50,7 +50,7 @@ class Results:
     log: list[dict[str, Any]]
     calibration: Calibration | None
     mesh: trimesh.Trimesh | None
-    fields: Fields | None
+    fields: SolvedScene | None
     maps: Maps | None
     thumbs: dict[str, np.ndarray]  # by the stem of their file in thumbs/, sRGB
     problems: list[str] = field(default_factory=list)  # files that are there and cannot be read
@@ -103,7 +103,7 @@ def _names_of_thumbs(run_dir: Path) -> list[str]:
     return sorted(path.name for path in folder.glob("*.jpg")) if is_own_folder(folder) else []
 
 
-def _fields_of(run: StoredRun) -> Fields:
+def _fields_of(run: StoredRun) -> SolvedScene:
     """Return the solved scene, if the calibration is of the same one."""
     fields = run.fields
     assert run.calibration  # which is compared with it

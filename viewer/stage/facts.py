@@ -21,7 +21,7 @@ from reconstruct.appearance.brdf import MATERIALS, SHARPNESS, facing_reflectance
 from reconstruct.export.export import UNIT_WORDS, Contents
 from reconstruct.export.first_view import LAMP, SKY
 from reconstruct.export.stage_scene import FULL_WEIGHT, GROUND_HALF, StageScene
-from reconstruct.fields import Fields
+from reconstruct.fields import SolvedScene
 from reconstruct.mesh.evidence import KINDS
 from reconstruct.render.studio import KEY_DISTANCE, LAMP_RADII, Studio, direction_of, looking_at, towards
 from reconstruct.stored_run.stage_pack import FORMAT
@@ -39,7 +39,7 @@ SIGNS = {"seen": "seen", "shadow": "shadow", "guess": "unconstrained"}  # of the
 WORDS = {"seen": "seen in the photos", "shadow": "held by shadows", "unconstrained": "a guess"}
 
 
-def camera_facts(seen: Fields, studio: Studio) -> dict[str, Any]:
+def camera_facts(seen: SolvedScene, studio: Studio) -> dict[str, Any]:
     """Return a capture camera in shares of its picture's width and height, so that it holds at every size.
 
     `home` is the view from its place, towards the object: radians and world length.
@@ -66,7 +66,7 @@ def camera_facts(seen: Fields, studio: Studio) -> dict[str, Any]:
     }
 
 
-def lit_photos(run: StoredRun) -> list[tuple[str, int, Light, Fields]]:
+def lit_photos(run: StoredRun) -> list[tuple[str, int, Light, SolvedScene]]:
     """Return each photo's name, the number of its camera, its light, and what that camera saw.
 
     A photo of a further view is called VIEW/NAME, as its small copy is.
@@ -99,7 +99,7 @@ def light_facts(run: StoredRun, studio: Studio) -> list[dict[str, Any]]:
     ]
 
 
-def _place(light: Light, seen: Fields, studio: Studio) -> Float[np.ndarray, "3"]:
+def _place(light: Light, seen: SolvedScene, studio: Studio) -> Float[np.ndarray, "3"]:
     motion = seen.object_from_world
     if light.position is not None:
         return seen.in_common(light.position[None])[0]
@@ -171,19 +171,19 @@ def size_sentence(run: StoredRun) -> str:
     return Contents(extents=(x, y, z)).sentence(run.unit)
 
 
-def home_view(fields: Fields, studio: Studio) -> dict[str, float]:
+def home_view(fields: SolvedScene, studio: Studio) -> dict[str, float]:
     """Return the first view: from where the photos were taken, towards the object."""
     return camera_facts(fields.views()[0], studio)["home"]
 
 
-def home_pose(fields: Fields, studio: Studio) -> Pose:
+def home_pose(fields: SolvedScene, studio: Studio) -> Pose:
     """Return world_from_camera of the first view."""
     home = home_view(fields, studio)
     eye = studio.centre + home["distance"] * towards(home["azimuth"], home["elevation"])
     return looking_at(eye, studio.centre)
 
 
-def box_at_home(vertices: Float[np.ndarray, "n 3"], fields: Fields, studio: Studio) -> list[float]:
+def box_at_home(vertices: Float[np.ndarray, "n 3"], fields: SolvedScene, studio: Studio) -> list[float]:
     """Return the object's box in the first view: left, top, right and bottom as tangents from its axis."""
     pose = home_pose(fields, studio)
     seen = (vertices - pose.translation) @ pose.rotation
@@ -199,7 +199,7 @@ def outline_points(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]
     return points[np.unique((points @ ways).argmax(0))]
 
 
-def first_window(vertices: Float[np.ndarray, "n 3"], fields: Fields, studio: Studio) -> list[float]:
+def first_window(vertices: Float[np.ndarray, "n 3"], fields: SolvedScene, studio: Studio) -> list[float]:
     """Return what the first picture shows, as `box_at_home`: a square around the object with some of its ground."""
     left, top, right, bottom = box_at_home(vertices, fields, studio)
     half = FIRST_MARGIN * max(right - left, bottom - top) / 2
@@ -217,7 +217,7 @@ def _lamp(lamp: tuple[float, float], studio: Studio) -> dict[str, float]:
     }
 
 
-def _gloss(fields: Fields, scene: StageScene) -> dict[str, Any] | None:
+def _gloss(fields: SolvedScene, scene: StageScene) -> dict[str, Any] | None:
     if fields.gloss is None or not scene.gloss.shape[1]:
         return None
     lobes = fields.gloss.lobes[: scene.gloss.shape[1]] * scene.gloss_scale
