@@ -23,8 +23,8 @@ from capture.files.regular import why
 from capture.files.schema import Number, Text, as_type
 from capture.session.capture import MOST_VIEWS
 from reconstruct.appearance.brdf import LOBES, Gloss
-from reconstruct.sdf.carried import carried
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.level_set import carried
 from reconstruct.tensor_file import Layout, parsed, read_tensors, refuse_outside, write_tensors
 
 SIGMAS = 1.64  # of its noise by which the held-out error must fall: chance alone does that once in twenty times

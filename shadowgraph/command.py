@@ -23,10 +23,9 @@ from rich.console import Console
 
 from capture.errors import FOR_STUDIO, Remedy, UserError
 from capture.files.names import in_one_line, refuse_no_folder
-from shadowgraph.batch_command import Batch, do_batch
 from shadowgraph.export_command import Export, Relight, do_export, do_relight
 from shadowgraph.options import Calibrate, Check, Doctor, Evaluate, Import, PrintBoard, Reconstruct, Report, Run, View
-from shadowgraph.run_command import check, folder_name, run_stages
+from shadowgraph.run_command import Batch, check, do_batch, folder_name, run_stages
 from shadowgraph.studio_command import Studio, Watch, do_studio, do_watch
 from shadowgraph.terminal import Display, print_lines
 from viewer.studio.words import in_page_words

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.checks.edge_sharpness import SMEARED, edge_sharpness
+from capture.checks.camera_motion import SMEARED, edge_sharpness
 
 HEIGHT, WIDTH, PHOTOS = 480, 640, 8
 ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)

@@ -17,9 +17,9 @@ from calibration.known_scene import KnownScene
 from capture.files.atomic import write_json
 from reconstruct.run import pipeline
 from reconstruct.run import report_json as summary
-from reconstruct.run_folder import cost
-from reconstruct.run_folder.cost import give_memory_back, memory_room, share_memory_among_threads
+from reconstruct.run_folder import forecast
 from reconstruct.run_folder.folder import PLAN, RunFolder
+from reconstruct.run_folder.forecast import give_memory_back, memory_room, share_memory_among_threads
 from reconstruct.source.photos import MARGIN, OVERRIDE, plan_for, predicted_memory, read_plan
 from reconstruct.source.source import RunOptions, Source
 
@@ -79,8 +79,8 @@ def test_a_run_may_hold_what_is_free_and_no_more_than_its_limits(tmp_path, monke
     group.mkdir(parents=True, exist_ok=True)
     for name, text in (("memory.max", "3000000"), ("memory.current", "2500000"), ("memory.stat", "inactive_file 7")):
         (group / name).write_text(text)
-    monkeypatch.setattr(cost, "GROUPS", tmp_path)
-    assert cost._group_rooms(10) == [500017]
+    monkeypatch.setattr(forecast, "GROUPS", tmp_path)
+    assert forecast._group_rooms(10) == [500017]
 
 
 def test_a_run_keeps_to_its_decision_and_writes_which_photos_it_left_out(tmp_path):

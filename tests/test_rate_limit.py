@@ -1,4 +1,4 @@
-from viewer.display.rate_limit import MIN_INTERVAL_S, RateLimit
+from viewer.page.page import MIN_INTERVAL_S, RateLimit
 
 
 class Hands:

@@ -14,8 +14,8 @@ from reconstruct.run.report_json import _requests
 from reconstruct.run.solve_stage import RequestSteering
 from reconstruct.run_folder.folder import RunFolder, read_log
 from reconstruct.run_folder.requests import ON_REQUEST, PAUSED, REQUESTS, make_request, open_requests, withdraw
+from reconstruct.solve.level import Rescheduled
 from reconstruct.solve.solver import NO_STEERING, fit_steered
-from reconstruct.solve.steering import Rescheduled
 
 pytestmark = pytest.mark.usefixtures("hull_start")
 

@@ -19,9 +19,9 @@ from waiting import wait_until
 
 from viewer.studio import sockets
 from viewer.studio_server import gate, phones
+from viewer.studio_server.gate import WEB
 from viewer.studio_server.routes import owner_app
 from viewer.studio_server.serve import PhoneRoutes
-from viewer.studio_server.web_files import WEB
 
 LOCAL_STYLE = re.compile(r"\bstyle\s*=|<style|javascript:|\bon\w+\s*=\s*[\"']", re.IGNORECASE)
 

@@ -6,9 +6,16 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from reconstruct.shadowneus.camera_rays import CameraRays, expected_depth, find_hits
+from reconstruct.shadowneus.camera_rays import (
+    CameraRays,
+    ShadowRays,
+    expected_depth,
+    find_hits,
+    light_left,
+    light_left_telescoped,
+    place_samples,
+)
 from reconstruct.shadowneus.config import ABLATIONS, ShadowSamples, TrainConfig, ablated, shortened_training
-from reconstruct.shadowneus.shadow_rays import ShadowRays, light_left, light_left_telescoped, place_samples
 from reconstruct.shadowneus.train_step import bound_loss, contain_loss
 from reconstruct.shadowneus.trainer import learning_factor
 from reconstruct.torch_sdf import equations as render

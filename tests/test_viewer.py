@@ -18,11 +18,10 @@ from viewer.display.layers import (
     page_mesh,
     page_scale,
 )
-from viewer.display.rate_limit import RateLimit
 from viewer.display.run_follower import RunFollower, loss_curves, size_text, status
 from viewer.page.controls import continued
 from viewer.page.guard import GuardedServer
-from viewer.page.page import Page
+from viewer.page.page import Page, RateLimit
 
 ROOT = Path(__file__).parent.parent
 ANY_PORT = 0

@@ -19,9 +19,8 @@ import websockets
 from waiting import PATIENCE_S
 
 from reconstruct.run.bundle import without_paths
-from viewer.page import guard, message_filter
-from viewer.page.guard import GuardedServer, is_loopback
-from viewer.page.message_filter import InvalidMessage, refuse_strange
+from viewer.page import guard
+from viewer.page.guard import GuardedServer, InvalidMessage, is_loopback, refuse_strange
 from viewer.page.serve import address_lines, view
 
 ANY_PORT = 0
@@ -311,7 +310,7 @@ STRANGE = [
     {"type": "SceneNodeClickMessage", "name": "/mesh"},
     {"type": "GuiUpdateMessage", "uuid": "x", "updates": [["value", 1]]},
     {"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": 1, "visible": True}},
-    {"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": "0" * message_filter.LARGEST}},
+    {"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": "0" * guard.LARGEST}},
 ]
 
 

@@ -3,6 +3,7 @@
 import importlib
 import pkgutil
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 from calibration.known_scene import Importer, KnownScene
@@ -18,12 +19,13 @@ BOARD, SETTINGS = "board", "session.toml"
 OF_A_CAPTURE = (SETTINGS, BOARD)  # what a capture of ours has and no other layout; lists of lights may lie by it
 
 
-def importers() -> list[Importer]:
+@cache
+def importers() -> tuple[Importer, ...]:
     """Return the importers of other programs' layouts: IMPORTER of every module of this package that has one."""
     package = importlib.import_module(__name__.rpartition(".")[0])
     modules = (importlib.import_module(f"{package.__name__}.{m.name}") for m in pkgutil.iter_modules(package.__path__))
     found = (getattr(module, "IMPORTER", None) for module in modules)
-    return [importer for importer in found if importer is not None]
+    return tuple(importer for importer in found if importer is not None)
 
 
 def find_importer(folder: Path, lights: Path | None = None) -> Importer | None:

@@ -31,8 +31,8 @@ from reconstruct.labels.photometric_stereo import ObjectLabels, ground_light, la
 from reconstruct.labels.uneven_ground import cut_at_relief, ground_relief, ground_visibility
 from reconstruct.render.interreflection import photo_interreflection, true_scale
 from reconstruct.scene import Scene, ground_points, light_share
-from reconstruct.sdf.carried import carried
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.level_set import carried
 from reconstruct.sdf.rays import first_hits
 
 

@@ -26,8 +26,8 @@ from reconstruct.labels.supervision import Supervision, supervise
 from reconstruct.lies.alignment import Alignment, SeenSurface, align, seen_surface
 from reconstruct.lies.motion_refine import LieRays, MotionTrial, compare, refined_motion
 from reconstruct.scene import Scene
-from reconstruct.sdf.carried import values_on
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.level_set import values_on
 from reconstruct.views import Scenes
 
 NEAR = 3.0  # voxels from a seen point, within which its lie's surface is trusted

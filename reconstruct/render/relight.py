@@ -1,10 +1,13 @@
 """Relighting: pictures of a solved scene under new lights, with shadows and highlights.
 
 relight: one light without extent. relight_soft: a spherical lamp. environment: an environment map.
+
+Predicted photos of a calibrated scene, for comparison with the real photos.
 """
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -12,8 +15,10 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from calibration.calibration import Calibration
 from calibration.light import Light, irradiance
 from reconstruct.appearance.brdf import reflectance, specular
+from reconstruct.fields import SolvedScene
 from reconstruct.render.environment import patches, sky_lights, sky_size
 from reconstruct.render.g_buffer import Interreflection, RenderView
 from reconstruct.render.receivers import Receivers, across, disc
@@ -254,3 +259,34 @@ def _evenness(view: RenderView, lit: Bool[Tensor, "height width"], size: tuple[i
         coefficients = torch.einsum("nm,mlc->nlc", weights[some], view.gloss.lobes)
         out[some] = reflectance(coefficients, cosine[some]) / summed[some]
     return out
+
+
+def photographed(view: RenderView, calibration: Calibration, photo: str) -> Float[Tensor, "height width 3"]:
+    """Render the scene, linear, under all lights of one photo and the ambient light."""
+    first, *others = _lights_of(calibration, photo)
+    picture = relight(view, first, calibration.beam, calibration.ambient)
+    for light in others:  # without ambient light, which counts once
+        picture = picture + relight(view, light, calibration.beam)
+    return picture
+
+
+def shadow_picture(view: RenderView, calibration: Calibration, photo: str) -> Float[Tensor, "height width 3"]:
+    """Return 1 at the view's pixels where light of one photo arrives, 0 where none does."""
+    share = torch.stack([lit_share(view, light) for light in _lights_of(calibration, photo)]).amax(0)
+    return share[..., None].expand(*share.shape, 3)
+
+
+def with_refined_lights(calibration: Calibration, fields: SolvedScene) -> Calibration:
+    """Return the calibration with the lights refined by the solve."""
+    used = [i for i, light in enumerate(calibration.lights) if light.used]
+    if fields.lights is None or len(used) != len(fields.lights):
+        return calibration
+    lights = list(calibration.lights)
+    for i, now in zip(used, fields.lights.double().numpy()[:, :3], strict=True):
+        is_point = lights[i].position is not None
+        lights[i] = replace(lights[i], **{"position": now} if is_point else {"direction": now / np.linalg.norm(now)})
+    return replace(calibration, lights=tuple(lights))
+
+
+def _lights_of(calibration: Calibration, photo: str) -> list[Light]:
+    return [light for light in calibration.lights if light.photo == photo]

@@ -18,8 +18,7 @@ from capture.decode.formats import read_size
 from capture.decode.sandbox import confinement
 from capture.errors import UserError
 from reconstruct.run.presets import preset, shortened
-from reconstruct.run_folder.cost import memory_room
-from reconstruct.run_folder.forecast import duration_text
+from reconstruct.run_folder.forecast import duration_text, memory_room
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import thread_count, visibility

@@ -38,8 +38,8 @@ from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.trainer import train
 from reconstruct.solve.backend import solver_device, training_device
 from reconstruct.solve.checkpoint import SolveState, load_state, save_state
+from reconstruct.solve.level import Rescheduled
 from reconstruct.solve.solver import SolveReporter, fit_steered
-from reconstruct.solve.steering import Rescheduled
 from reconstruct.source.photos import Photos, read_photos
 from reconstruct.source.source import LONG_SIDES, RunOptions, Source
 from reconstruct.views import Scenes

@@ -17,7 +17,7 @@ from capture.errors import Remedy, UserError
 from capture.files.atomic import TEMPORARY, atomic_file, write_json
 from capture.files.names import stored_file
 from capture.files.regular import read_regular
-from reconstruct.run_folder.cost import Cost, PeakMemory, cpu_seconds
+from reconstruct.run_folder.forecast import Cost, PeakMemory, cpu_seconds
 from reconstruct.run_folder.lock import release_lock, take_lock
 from reconstruct.run_folder.requests import withdraw_all
 from reconstruct.stored_run.documents import MANIFEST, MANIFEST_FORMAT, log_lines, read_manifest

@@ -8,11 +8,19 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from reconstruct.scene import irradiance
-from reconstruct.shadowneus.camera_rays import CameraRays, Hits, expected_depth, sphere_span
+from reconstruct.shadowneus.camera_rays import (
+    CameraRays,
+    Hits,
+    ShadowRays,
+    expected_depth,
+    light_left,
+    light_left_telescoped,
+    place_samples,
+    sphere_span,
+)
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.mlp_field import specular
 from reconstruct.shadowneus.model import Model
-from reconstruct.shadowneus.shadow_rays import ShadowRays, light_left, light_left_telescoped, place_samples
 from reconstruct.shadowneus.train_pixels import TrainPixels
 from reconstruct.torch_sdf import equations as render
 

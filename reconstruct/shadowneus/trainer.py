@@ -26,8 +26,8 @@ from reconstruct.shadowneus.train_pixels import TrainPixels, make_train_pixels
 from reconstruct.shadowneus.train_step import losses
 from reconstruct.shadowneus.unit_frame import UnitFrame, object_frame, read_onto_grid, unit_height
 from reconstruct.solve.checkpoint import FINGERPRINT, FORMAT, Log, fingerprint, read_checkpoint, write_checkpoint
+from reconstruct.solve.level import Steering
 from reconstruct.solve.solver import NO_STEERING, SolveReporter
-from reconstruct.solve.steering import Steering
 from reconstruct.tensor_file import parsed
 
 VERSION = "1"

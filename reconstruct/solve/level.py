@@ -1,13 +1,20 @@
-"""One level of a solve: move the surface, and uncertain lights, along the gradients of the rays."""
+"""One level of a solve: move the surface, and uncertain lights, along the gradients of the rays.
+
+Requests of page visitors to a solve: pause, next level, stop, resolution. They act where a solve can be resumed.
+
+A solve without requests is not affected. A stopped solve is resumed bit for bit by the same command.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 from reconstruct.config import FitConfig, Level
 from reconstruct.labels.held_out import HeldOut, ValidationRays
 from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
 from reconstruct.sdf.level_set import LevelSet
+from reconstruct.solve.checkpoint import SolveState
 from reconstruct.solve.early_stopping import REST, EarlyStopping, StepGuard
 from reconstruct.solve.light_refine import MovingLights, lit_from
 from reconstruct.solve.operators import JointPasses
@@ -17,6 +24,55 @@ REDISTANCE_EVERY = REST  # iterations: steps of at most 0.5 voxel stay well insi
 LOOK_EVERY = REST // 2  # iterations between two looks for rays that are not settled
 HORIZON = 1.5  # largest steps that the surface moves between two looks, nearly everywhere
 NO_ERRORS_YET = EarlyStopping()
+
+
+@dataclass(frozen=True)
+class Rescheduled:
+    """The end of a solve that has to continue with another schedule."""
+
+    state: SolveState  # at the beginning of a level of `config`
+    config: FitConfig
+    resolution: str  # the name of its preset
+
+
+@runtime_checkable
+class Steering(Protocol):
+    """Requests that a solve polls as it runs."""
+
+    def wait(self, save: Callable[[], None]) -> None:
+        """Return at once, or after a pause; `save` is called before a pause."""
+        ...
+
+    def is_stopped(self) -> bool:
+        """Return whether to save and end with the current surface; asked, as the next two, where a solve can resume."""
+        ...
+
+    def ends_level(self) -> bool:
+        """Return whether to end this level, and continue with the next one if any."""
+        ...
+
+    def ends_solve(self, state: SolveState, config: FitConfig) -> bool | Rescheduled:
+        """Return whether to end the solve after a level, and with what other schedule to continue if any."""
+        ...
+
+
+class NoSteering:
+    """Steering without requests."""
+
+    def wait(self, save: Callable[[], None]) -> None:
+        """Never."""
+
+    def is_stopped(self) -> bool:
+        """Never."""
+        return False
+
+    def ends_level(self) -> bool:
+        """Never."""
+        return False
+
+    def ends_solve(self, state: SolveState, config: FitConfig) -> bool:
+        """Never."""
+        return False
 
 
 def _between(ends: tuple[float, float], share: float) -> float:

@@ -25,10 +25,9 @@ from reconstruct.sdf.level_set import LevelSet, resampled
 from reconstruct.sdf.normal_fusion import combine_with_normals
 from reconstruct.solve.checkpoint import CheckpointWriter, SolveState, fingerprint, load_state, save_state
 from reconstruct.solve.early_stopping import EarlyStopping, NotFiniteError
-from reconstruct.solve.level import LevelFit, is_rest
+from reconstruct.solve.level import LevelFit, NoSteering, Rescheduled, Steering, is_rest
 from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift
 from reconstruct.solve.ray_counts import ray_counts
-from reconstruct.solve.steering import NoSteering, Rescheduled, Steering
 from reconstruct.solve.trials import before_trial, hull_is_better, shadow_doubts, try_lights
 from reconstruct.solve.unseen import without_unsupported_matter
 from reconstruct.torch_sdf.rays import BATCHES

@@ -27,7 +27,7 @@ from capture.photos.photo import PhotoStack, read_alpha, read_grey, read_stack
 from capture.photos.radiometry import with_one_white_balance, without_ambient
 from capture.session.session import Session
 from reconstruct.labels.outline import bright_object
-from reconstruct.run_folder.cost import memory_room
+from reconstruct.run_folder.forecast import memory_room
 from reconstruct.source.source import AUTO, CALIBRATION_LONG_SIDE, LONG_SIDES, RunOptions, Source
 
 PROGRAM = 0.5e9  # bytes: interpreter, torch, compiled kernels

@@ -4,6 +4,11 @@ viser 1.1 accepts a WebSocket from any origin, so any web page open in the user'
 its controls, also on 127.0.0.1. It passes none of the options on that `websockets` has against that, and a proxy before
 it would leave its own port open; so while viser opens its socket, the function that opens it gets these options too.
 A visitor over a network sends the token of the printed address once, and a cookie from then on.
+
+Which messages of a browser viser may see: those that our page sends, none large, no file.
+
+viser 1.1 decodes every message, keeps the parts of an upload without a limit, and lets a message set any attribute of a
+control.
 """
 
 import asyncio
@@ -20,6 +25,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+import msgspec
 import viser
 import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
@@ -28,9 +34,17 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from capture.errors import UserError
-from viewer.page.message_filter import InvalidMessage, refuse_strange
 from viewer.stage.files import HEADERS, HTML, StageFile, StageFiles
 
+LARGEST = 1 << 16  # bytes of one message: decoded, it may need a hundred times its size
+VALUE = "GuiUpdateMessage"  # a control was moved or pressed
+KINDS = (
+    VALUE,
+    "TransformControlsDragEndMessage",
+    "TransformControlsDragStartMessage",
+    "TransformControlsUpdateMessage",
+    "ViewerCameraMessage",
+)
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 PAGE = ("/", "/index.html")  # viser's page is one file
 STAGE, STAGE_DOCUMENT = "/stage/", "/stage/stage.json"  # the run as a picture, beside viser's page
@@ -63,6 +77,33 @@ OWN_HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+
+
+class InvalidMessage(Exception):
+    """A message that our page never sends; the connection is closed."""
+
+
+class _Message(msgspec.Struct):
+    type: str
+    updates: Any = None
+
+
+def refuse_strange(raw: bytes | str) -> None:
+    """Return if the page sends such messages.
+
+    Raises:
+        InvalidMessage: it is malformed, large, of another kind, or changes more of a control than its value.
+    """
+    if isinstance(raw, str) or len(raw) > LARGEST:
+        raise InvalidMessage(f"{len(raw)} characters or bytes, where the page sends at most {LARGEST} bytes")
+    try:
+        message = msgspec.msgpack.decode(raw, type=_Message)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InvalidMessage("not a message") from error
+    if message.type not in KINDS:
+        raise InvalidMessage("a kind that the page does not send")
+    if message.type == VALUE and not (isinstance(message.updates, dict) and set(message.updates) == {"value"}):
+        raise InvalidMessage("a control's value is all that the page changes")
 
 
 class GuardedServer(viser.ViserServer):

@@ -2,10 +2,12 @@
 
 A run without a browser has no cost for it, a page that fails does not stop the run, and a page opened late shows the
 results so far. What is done with a finished run is the stage's (viewer/stage), to which the page leads.
-viewer/display/rate_limit.py limits how often it sends expensive data.
+RateLimit says how often it may send what costs much, so that a run beside it keeps the processor.
 """
 
 import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +40,44 @@ from viewer.display.layers import (
     page_mesh,
     page_scale,
 )
-from viewer.display.rate_limit import RateLimit
 from viewer.display.run_follower import HULL, RunFollower, Status, loss_curves, size_text, stage_of, status
 from viewer.page.controls import Controls
 
+MIN_INTERVAL_S = 2.0  # as often as a run writes its growing mesh, and as a visitor can follow
+COST_FACTOR = 25.0  # times what the last sending cost: at most a 25th of one processor, 4 % of a run that uses one
 REREAD_EVERY = 10  # polls, after which a folder without changes is read, because a killed run makes none
+
+
+class RateLimit:
+    """Says when the next sending may begin: MIN_INTERVAL_S, or COST_FACTOR times its cost, after the last one began.
+
+    The cost of a sending is the CPU time of the whole process from its beginning until `is_due` is called again: other
+    threads do the sending, once to each visitor.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic, spent: Callable[[], float] = time.process_time):
+        """Allow the first sending at once.
+
+        Args:
+            clock: seconds.
+            spent: CPU seconds of this process.
+        """
+        self._clock, self._spent = clock, spent
+        self._begun: tuple[float, float] | None = None  # clock and CPU seconds when the last sending began
+        self._cost: float | None = None  # CPU seconds of the last sending; None: not asked since
+
+    def begin(self) -> None:
+        """Note that a sending begins."""
+        self._begun, self._cost = (self._clock(), self._spent()), None
+
+    def is_due(self) -> bool:
+        """Return whether another sending may begin."""
+        if self._begun is None:
+            return True
+        start, before = self._begun
+        if self._cost is None:
+            self._cost = self._spent() - before
+        return self._clock() - start >= max(MIN_INTERVAL_S, COST_FACTOR * self._cost)
 
 
 class Page:

@@ -19,7 +19,7 @@ from reconstruct.detail.file import Detail
 from reconstruct.detail.fit import with_detail
 from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import RenderView, look
-from reconstruct.render.photo_prediction import photographed, shadow_picture, with_refined_lights
+from reconstruct.render.relight import photographed, shadow_picture, with_refined_lights
 from reconstruct.stored_run.maps import thumbnail_name
 from viewer.display.run_follower import size_text
 from viewer.report import document as doc

@@ -2,16 +2,20 @@
 
 The owner's listener is bound to this machine and asks for the token of the printed address all the same, because other
 users of the machine can reach it. The phones' listener has its own secrets, see viewer/studio/phones.py.
+
+Our own files for browsers.
 """
 
 import errno
 from collections.abc import Callable
 from functools import partial
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from starlette.requests import Request
-from starlette.responses import JSONResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from websockets.datastructures import Headers
 
@@ -21,6 +25,9 @@ from capture.files.names import in_one_line
 from viewer.page.guard import COOKIE, is_own_page, is_same
 from viewer.studio.words import in_page_words, without_folder
 
+WEB = Path(str(resources.files("viewer.studio_server") / "web"))
+TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+REVALIDATE = {"Cache-Control": "no-cache"}
 SAFE = ("GET", "HEAD")
 LARGEST_BODY = 1 << 20  # bytes of a request that is no piece of a file
 POLICY = (
@@ -41,6 +48,23 @@ FRAMED_POLICY = (
     "frame-ancestors 'self'; base-uri 'none'; form-action 'none'"
 )
 NEEDS_ADDRESS = "Open the address that shadowgraph printed, with the token at its end.\n"
+
+
+def web_file(name: str) -> Response:
+    """Return one of our own files."""
+    return FileResponse(WEB / name, media_type=TYPES[Path(name).suffix], headers=REVALIDATE)
+
+
+def file_routes(names: tuple[str, ...], index: str) -> list[Route]:
+    """Return a route for each of our files, and / for the page."""
+
+    def route(name: str, path: str) -> Route:
+        async def answer(_request: Request) -> Response:
+            return web_file(name)
+
+        return Route(path, answer, methods=["GET"])
+
+    return [route(index, "/"), *(route(name, f"/{name}") for name in names)]
 
 
 class Gate:

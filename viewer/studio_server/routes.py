@@ -19,10 +19,9 @@ from viewer.stage.page import page_policy
 from viewer.studio import boards
 from viewer.studio.example import example_page
 from viewer.studio.studio import Studio
-from viewer.studio_server.gate import FRAMED_POLICY, read_body, read_object, sentences, text_of
+from viewer.studio_server.gate import FRAMED_POLICY, file_routes, read_body, read_object, sentences, text_of
 from viewer.studio_server.phones import Phones
 from viewer.studio_server.uploads import Uploads
-from viewer.studio_server.web_files import file_routes
 
 OWNER_FILES = ("studio.css", "dom.js", "home.js", "capture.js", "result.js", "board.js", "upload.js", "app.js")
 OWNER_FILES += ("hemisphere.js", "icon.svg", "phones.js", "save.js", "voice.js", "queue.js")

@@ -21,11 +21,10 @@ from viewer.page.guard import COOKIE
 from viewer.studio.folder import CAPTURES, RUNS, StudioFolder, is_capture, is_run
 from viewer.studio.sockets import free_socket, http_server
 from viewer.studio.studio import Studio
-from viewer.studio_server.gate import Gate, OwnerSecret, read_object, sentences, text_of
+from viewer.studio_server.gate import Gate, OwnerSecret, file_routes, read_object, sentences, text_of, web_file
 from viewer.studio_server.phones import EVERYWHERE, Door, Phone, Phones
 from viewer.studio_server.routes import owner_app
 from viewer.studio_server.uploads import Uploads
-from viewer.studio_server.web_files import file_routes, web_file
 
 COOKIE_NAME = f"{COOKIE}-phone"
 FILES = ("studio.css", "dom.js", "phone.js", "album.js", "live.js", "upload.js", "hemisphere.js", "voice.js")
