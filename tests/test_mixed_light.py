@@ -43,6 +43,19 @@ def test_ordinary_photos_are_one_group():
     assert find_mixture(numbers(photograph(Recipe(n_photos=N, width=WIDTH)).stack)) is None
 
 
+@pytest.mark.parametrize("photos", [range(12), range(12, 26), range(18, 26)], ids=str)
+def test_a_second_light_that_came_or_went_is_told_where_powers_are_hardly_known(photos):
+    """As in pictures of a phone's pipeline: one photo's power says little, their order says the rest."""
+    rng, n = np.random.default_rng(1), 26
+    both = np.isin(np.arange(n), photos)
+    clear = rng.random(n) < np.where(both, 0.2, 0.9)
+    in_shadow = np.where(clear, 0.08 + 0.08 * both + 0.01 * rng.normal(size=n), np.nan)
+    found = find_mixture(
+        PhotoLight(0.7 * both + 0.25 * rng.normal(size=n), in_shadow, 0.35 * rng.normal(size=n), clear)
+    )
+    assert found is not None and (found.spoilt() == both).all()
+
+
 @pytest.mark.parametrize(("ratio", "first"), [(0.75, 9), (1.6, 12)])
 def test_a_flashlight_that_changes_its_power_is_told_from_which_photo_on(lights, ratio, first):
     stack = photograph(

@@ -7,13 +7,14 @@ them shows are explained in four ways, and the likelihood of all four numbers te
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.light import Light
 from capture.checks.ambient_light import ALIKE, Shadows, excess
-from capture.checks.mixture import RARE, STEADY, costs, price, second_group, which_photos
+from capture.checks.mixture import STEADY, costs, price, which_photos
 
 SECOND_LIGHT = "a second light is on, as the ground's brightness and the shadows tell"
 MISFIT = 0.35  # log: by which one flashlight's misfit varies between photos, as its height and beam do
@@ -85,17 +86,18 @@ def mixture_of(lights: Sequence[Light], misfit: Mapping[str, float], shadows: Sh
 def find_mixture(light: PhotoLight) -> MixedLight | None:
     """Return the two groups of photos that explain their numbers best, and the cause; None if one group does.
 
-    Groups start as one number has them; then each photo goes where all its numbers fit better.
+    Groups start as every cut of the photos, in the order that they were taken in and in that of each number; then each
+    photo goes where all its numbers fit better.
     """
-    best, found = float(_costs(light, np.zeros(len(light.log_power), bool), "")[0].sum()), None
-    numbers = ((light.log_power, STEADY), (light.in_shadow, ALIKE), (light.log_misfit, MISFIT))
-    starts = [second_group(values, noise) for values, noise in numbers]
-    for start in [*starts, ~light.one_depth]:
-        for cause in FREE if start is not None and 0 < start.sum() < len(start) else ():
-            assert start is not None
-            groups, trial = _settled(light, start, cause)
-            if trial < best:
-                best, found = trial, MixedLight(cause, groups, float(np.exp(_apart(light.log_power, groups))))
+    n = len(light.log_power)
+    best, found = float(_costs(light, np.zeros(n, bool), "")[0].sum()), None
+    ranks = [np.arange(n)]
+    ranks += [np.argsort(np.argsort(x)) for x in (light.log_power, light.in_shadow, light.log_misfit, light.one_depth)]
+    starts = [side for rank in ranks for cut in range(1, n) for side in (rank < cut, rank >= cut)]
+    for start, cause in product(starts, FREE):
+        groups, trial = _settled(light, start, cause)
+        if trial < best:
+            best, found = trial, MixedLight(cause, groups, float(np.exp(_apart(light.log_power, groups))))
     return found
 
 
@@ -112,7 +114,6 @@ def _settled(
     for _ in range(ROUNDS):
         table = _costs(light, groups, cause)
         total = float(table[groups.astype(int), np.arange(len(groups))].sum()) + price(groups, FREE[cause])
-        total += RARE if cause == "second light" else 0.0  # photos are left out for it
         if total >= best:
             break
         found, best = groups, total

@@ -37,28 +37,16 @@ def costs(
 
 
 def price(groups: Bool[np.ndarray, " photos"], free: int = FREE) -> float:
-    """Return what a second group costs: which photo is in which group, and numbers that it leaves free."""
+    """Return what a second group costs: which photo is in which group, and numbers that it leaves free.
+
+    A group that begins or ends with one of the photos, in their order, is told by that photo, any other photo by photo.
+    """
     n, share = len(groups), groups.mean()
     shares = np.array([share, 1 - share])
-    return float(RARE - n * (shares * np.log(np.maximum(shares, 1 / n))).sum() + 0.5 * free * np.log(n))
-
-
-def second_group(values: Float[np.ndarray, " photos"], noise: float) -> Bool[np.ndarray, " photos"] | None:
-    """Return which photos have the larger numbers, if these are two groups; None if they are one.
-
-    Args:
-        values, noise: as of `costs`; photos whose number is unknown are in neither group.
-    """
-    known = np.flatnonzero(np.isfinite(values))
-    order = known[np.argsort(values[known])]
-    own = values[order]
-    best, found = costs(own, np.zeros(len(own), bool), noise)[0].sum(), None
-    for first in range(1, len(own)):
-        groups = np.arange(len(own)) >= first
-        trial = costs(own, groups, noise)[groups.astype(int), np.arange(len(own))].sum() + price(groups)
-        if trial < best:
-            best, found = trial, order[first:]
-    return None if found is None else np.isin(np.arange(len(values)), found)
+    each = -n * float((shares * np.log(np.maximum(shares, 1 / n))).sum())
+    changes = int((groups[1:] != groups[:-1]).sum())
+    which = np.log(2) + min(each, np.log(2 * n) if changes == 1 else np.inf)  # log 2: in which of the ways it is told
+    return float(RARE + which + 0.5 * free * np.log(n))
 
 
 def levels(values: Float[np.ndarray, " photos"], noise: float) -> Float[np.ndarray, " photos"]:
