@@ -21,8 +21,6 @@ import trimesh
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from viewer.display.pictures import depth_picture, mesh_picture, normal_picture
-
 from calibration.calibrated_views import load_views
 from calibration.calibration import Calibration
 from calibration.light import Light
@@ -32,6 +30,7 @@ from reconstruct.run.solve_stage import prepare_scene
 from reconstruct.source.photos import read_photos
 from reconstruct.source.source import RunOptions, open_source
 from reconstruct.stored_run.stored_run import StoredRun
+from viewer.report.drawing import depth_picture, mesh_picture, normal_picture
 
 PICTURES = Path(__file__).parent / "pictures"
 HEIGHT = 300  # px of every panel

@@ -1,9 +1,9 @@
 """What stands before every request of a studio: whose page it comes from, the secret, headers, and faults as sentences.
 
 The owner's listener is bound to this machine and asks for the token of the printed address all the same, because other
-users of the machine can reach it. The phones' listener has its own secrets, see viewer/studio/phones.py.
+users of the machine can reach it. The phones' listener has its own secrets, see viewer/studio_server/phones.py.
 
-Our own files for browsers.
+The studio's own files for browsers are read here, too.
 """
 
 import errno
