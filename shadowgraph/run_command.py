@@ -160,10 +160,10 @@ def check(command: Check, console: Console) -> None:
         console.print(reading, markup=False, highlight=False)
         from reconstruct.check.readiness import refuse_hopeless  # after the refusals, which need no torch
         from reconstruct.check.verdict import read_and_check
-        from reconstruct.run_folder.progress import told
+        from reconstruct.run_folder.progress import log_to
         from viewer.report.check_page import check_lines, write_check
 
-        with told("calibration", display.activity):
+        with log_to("calibration", display.activity):
             checked = read_and_check(source, options)
     out = results_folder(command)
     written = write_check(checked, out)
