@@ -40,10 +40,14 @@ def find_shadows(field: GroundField) -> GroundShadows:
     return bare_ground(field).shadows
 
 
-def bare_ground(field: GroundField) -> BareGround:
-    """Return the shadows and the object, and the ground under both as far as the photos tell it."""
+def bare_ground(field: GroundField, hint: Float[np.ndarray, "height width"] | float = 0.0) -> BareGround:
+    """Return the shadows and the object, and the ground under both as far as the photos tell it.
+
+    Args:
+        hint: see object_and_ground.
+    """
     seam = None if field.beyond is None else _seam(field.beyond)
-    found = object_and_ground(field, seam)
+    found = object_and_ground(field, seam, hint)
     likelihood = cv2.GaussianBlur(found.brightness, (0, 0), 0.7)
     if field.beyond is not None:
         likelihood = np.where(field.beyond | seam, np.float32(ODDS), likelihood)
