@@ -9,6 +9,7 @@ from ball_shadows import EYE, RADIUS, drawn
 from calibration.flashlight import joint_search, outline_lights
 from calibration.flashlight.fit import FlashlightFit, does_not_follow
 from calibration.flashlight.model import Evidence, Flashlights, free_tangent, log_irradiance
+from calibration.flashlight.wall import NO_WALL, Wall
 from calibration.lights.ground_cells import GroundCells
 from calibration.outlines.terms import OutlineTerms
 
@@ -18,8 +19,8 @@ def ball():
     return drawn()
 
 
-def _shaded(maps, lights: np.ndarray) -> Evidence:
-    """Outlines, and 2 % of noise on ground that flashlights light which are aimed 4 degrees about the ball."""
+def _shaded(maps, lights: np.ndarray, wall: Wall = NO_WALL, grain: float = 0.02) -> Evidence:
+    """Outlines, and grain on ground that flashlights light which are aimed 4 degrees about the ball."""
     rng = np.random.default_rng(4)
     x, y = np.meshgrid(np.linspace(-250, 250, 18), np.linspace(-150, 350, 18))
     points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
@@ -28,8 +29,8 @@ def _shaded(maps, lights: np.ndarray) -> Evidence:
     cells = GroundCells(points, np.full((*known.shape, 3), 0.2), known, np.zeros(3), EYE)
     evidence = Evidence.of(cells, np.ones(len(lights)), 0.0)
     aims = 30 * rng.standard_normal(lights.shape) * [1, 1, 0]
-    truth = Flashlights(lights, aims, np.zeros(len(lights)), np.array([3.0, 0.0, 0.0, 0.0]), 0.0, np.zeros(3))
-    grey = log_irradiance(truth, evidence) + 0.02 * rng.standard_normal(known.shape)
+    truth = Flashlights(lights, aims, np.zeros(len(lights)), np.array([3.0, 0.0, 0.0, 0.0]), 0.0, np.zeros(3), wall)
+    grey = log_irradiance(truth, evidence) + grain * rng.standard_normal(known.shape)
     return replace(evidence, log_grey=grey, outlines=OutlineTerms(maps, EYE, 0.0, every, every))
 
 
@@ -50,6 +51,30 @@ def test_lights_are_found_from_rough_starts_of_which_one_is_far_off(ball):
     fit = joint_search.searched([np.roll(rough, 3, axis=0), rough], _shaded(maps, lights))
     assert np.median(_off(fit.flashlights.positions, lights)) < 0.05 < 0.2 < np.median(_off(rough, lights))
     assert _off(fit.flashlights.positions, lights).max() < 0.08
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wall", [NO_WALL, np.array([1.8, np.log(300.0), 0.6]), np.array([-2.5, np.log(400.0), 0.6])])
+def test_a_wall_is_found_where_one_is_and_nowhere_else(ball, wall):
+    _, lights, maps = ball
+    rough = 0.9 * lights * np.exp(0.05 * np.random.default_rng(1).standard_normal(lights.shape))
+    found = joint_search.searched([rough], _shaded(maps, lights, wall, 0.005)).flashlights
+    assert np.median(_off(found.positions, lights)) < 0.03
+    if wall[2] > 0:
+        assert abs(np.angle(np.exp(1j * (found.wall[0] - wall[0])))) < 0.3
+    assert (found.wall[2] > 0.2) == (wall[2] > 0)
+
+
+@pytest.mark.parametrize("times", [0.7, 1.2, 1.5])
+def test_outlines_do_not_see_how_far_away_all_lights_are(ball, times):
+    """Moved so, the lights agree as the right ones do; merely raised, they do not."""
+    _, lights, maps = ball
+    evidence = _shaded(maps, lights)
+    moved = joint_search.farther(lights, evidence, times)
+    assert evidence.outlines is not None
+    assert np.median(_off(moved, lights)) > 0.15
+    by_height = evidence.outlines.misfit(lights * [1, 1, times])
+    assert np.percentile(evidence.outlines.misfit(moved), 80) < min(0.3, np.percentile(by_height, 80))
 
 
 def _with_one_lost(maps, lights: np.ndarray, k: int) -> tuple[FlashlightFit, Evidence]:
@@ -96,6 +121,6 @@ def test_fits_are_compared_by_the_cells_that_they_are_fitted_to(ball):
     fit = FlashlightFit(state, evidence, evidence.weight, joint_search.LOOSE, free_tangent)
     for misfit in (0.3, 2.0, 4.0):  # of noise
         found = [(0.0, fit, misfit * joint_search.NOISE), (1.5, fit, 1.1 * misfit * joint_search.NOISE)]
-        cells = (evidence.weight > 0).sum() / joint_search.ALIKE
+        cells = (evidence.weight > 0).sum() / joint_search._alike(evidence)
         gap = np.diff(joint_search._posteriors(found, evidence))
         np.testing.assert_allclose(gap, 1.5 + cells * np.log(1.1), rtol=1e-9)

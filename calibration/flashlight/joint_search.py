@@ -1,7 +1,7 @@
 """All lights from outlines of shadows and the shading of all photos together, from rough starts.
 
-The work is bounded by the number of photos: one pass from each start, one from what is best of all of them photo by
-photo, and one short fit per contrast. Photos that are at odds add none.
+The work is bounded by the number of photos: two passes from each start, one from what is best of all of them photo by
+photo, a few with other walls and at other distances, and one short fit per contrast. Photos that are at odds add none.
 """
 
 import logging
@@ -15,6 +15,7 @@ from calibration.flashlight.beam_profile import EXTRA_TERMS, RING_TERMS
 from calibration.flashlight.descent import refine
 from calibration.flashlight.fit import FAR, NEAR, START_AMBIENT, START_BEAM, FlashlightFit, misfits, variance_about
 from calibration.flashlight.model import (
+    LAMP,
     NOISE,
     Evidence,
     Flashlights,
@@ -26,6 +27,7 @@ from calibration.flashlight.model import (
     log_irradiance,
 )
 from calibration.flashlight.wall import NO_WALL, WALL_TERMS, Wall
+from calibration.lights import hand
 from capture.checks.robust import spread
 
 LOG = logging.getLogger(__name__)
@@ -35,43 +37,48 @@ EVERY = 3  # of the ground's cells: many, to tell two aims apart
 CLEARLY = 0.9  # of the residual with the present aim: better aims are taken
 AIM_ROUNDS = 2  # of looking for aims, each with the beam that the last one's aims gave
 USUAL_MISFIT = 0.03  # log units, before it is measured
-BLURS = tuple(np.geomspace(200.0, 1.0, 14))  # factors of an outline's sigma, at first 30 px: as far as rough starts lie
+# factors of an outline's sigma: at first 30 px, as far as rough starts lie, or 3 px, which far-off shading leaves there
+BLURS = (np.geomspace(200.0, 1.0, 14), np.geomspace(20.0, 1.0, 8))
 PER_BLUR = 3  # steps with each
 NO_GROUND = 1e-6  # log units: a misfit of less is that of no cell
 LOST = 1e9  # the cost of lights that no ground follows
-SCATTER = 4.0  # of the negative log posterior between joint fits from near starts: it has many small minima
-ALIKE = 80.0  # ground cells that are wrong together: within a photo 14 to 24 by their correlation, and photos err alike
+SCATTER = 30.0  # of the negative log posterior between searches by other steps: it has many small minima
+TELLS = 12.0  # independent numbers of a photo's ground: 50 by the correlation within it, and photos err alike
+FARTHER = (0.5, 0.6, 0.72, 0.85, 1.18, 1.4, 1.65, 2.0)  # along what outlines leave free: a hand's range
+ROUNDS = 3  # of other walls and distances, at most
+TRIED = 4  # of a round's: those that are fitted
+NEAR_INFINITY = 0.05  # a light that would be moved 20 times as far stays
+WALLS = tuple(np.array([azimuth, np.log(hand.NEAREST * 1.4), 0.5]) for azimuth in np.arange(8) * np.pi / 4)
 CONTRASTS = (1.1, 1.0, 0.9, 0.8, 0.7)  # of log brightness in the picture over that in the scene, that are tried
 CONTRAST_WIDTH = 0.1  # prior sigma of its logarithm about 0: phones lift whole regions that are dark
 _Found = tuple[float, FlashlightFit, float]  # cost of its outlines, fit, misfit of its shading (log units)
-LOOSE = Priors(log_power=0.1, beam=50.0, power_outlier=0.5)  # a hot centre, rings; a phone's tone differs by photo
+LOOSE = Priors(log_power=0.03, power_outlier=0.5)  # one lamp: .006 to .03 where it and the phone's exposure hold still
 
 
-def searched(
-    starts: Sequence[Float[np.ndarray, "photos 3"]], evidence: Evidence, wall: Wall = NO_WALL
-) -> FlashlightFit:
+def searched(starts: Sequence[Float[np.ndarray, "photos 3"]], evidence: Evidence) -> FlashlightFit:
     """Fit to outlines and shading together from rough starts; return the best fit.
 
     Outlines alone pull all lights too near, and one light that is too near, its beam aimed elsewhere, may agree with
     its photo. So both are fitted from the first step on, with an outline's sigma that falls to its own (graduated
     non-convexity) [Blake and Zisserman, Visual Reconstruction (1987)]. A light that is lost from one start is found
-    from another: the last pass begins with each photo's best. `between` of the fit holds what the others say that
-    explain the photos about as well.
+    from another: the last pass begins with each photo's best, and from the best of all other walls and distances are
+    tried. `between` of the fit holds what the others say that explain the photos about as well.
 
     Args:
         starts: positions, world.
         evidence: with outlines; photos that these do not trust are placed by their shading.
-        wall: that sends light back, as all cells of the ground tell it.
     """
     assert evidence.outlines is not None
     trusted = _trusted(evidence)
     found = []
     for number, one in enumerate(starts):
         LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", number + 1, len(starts) + 1)
-        found.append(_pass(_held(one, _weighted(trusted, USUAL_MISFIT), None, wall)[0], trusted, USUAL_MISFIT))
+        state = _held(one, _weighted(trusted, USUAL_MISFIT), None)[0]
+        found += [_pass(state, trusted, USUAL_MISFIT, blurs) for blurs in BLURS]
     best = found[int(_posteriors(found, trusted).argmin())]
     LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", len(starts) + 1, len(starts) + 1)
-    found.append(_pass(_best_of_each(best, found, evidence), trusted, best[2]))
+    found.append(_pass(_best_of_each(best, found, evidence), trusted, best[2], BLURS[0]))
+    found += _elsewhere(found[int(_posteriors(found, trusted).argmin())], trusted)
     posterior = _posteriors(found, trusted)
     best = found[int(posterior.argmin())]
     places = np.stack([one[1].flashlights.positions for one in found])
@@ -79,6 +86,52 @@ def searched(
     between = variance_about(best[1].flashlights.positions, places, weight) * evidence.outlines.trusted[:, None]
     fit = _settled(_best_of_each(best, found, evidence), evidence, best[2])[1]
     return replace(fit, between=between)
+
+
+def _elsewhere(best: _Found, evidence: Evidence) -> list[_Found]:
+    """Return fits from the best one with a wall in each of eight directions, or none, and at other distances.
+
+    Fits creep along what outlines leave free, and a wall is found from near its place only. Each is tried with the
+    places held; those that then shade best are fitted, and the best of these is where the next round begins.
+    """
+    found = []
+    for _ in range(ROUNDS):
+        state = best[1].flashlights
+        tried = [_shaded(best, state.positions, wall, evidence) for wall in (NO_WALL, *WALLS)]
+        places = [farther(state.positions, evidence, times) for times in FARTHER]
+        tried += [_shaded(best, one, state.wall, evidence) for one in places]
+        order = _posteriors(tried, evidence).argsort()[:TRIED]
+        found += [_settled(tried[k][1].flashlights, evidence, best[2]) for k in order]
+        before, best = best, [best, *found][int(_posteriors([best, *found], evidence).argmin())]
+        if best is before:
+            break
+    return found
+
+
+def _shaded(like: _Found, places: Float[np.ndarray, "photos 3"], wall: Wall, evidence: Evidence) -> _Found:
+    """Return the state with such places and wall whose beam, aims and powers shade the ground best."""
+    state = replace(like[1].flashlights, positions=places, wall=wall)
+    weighted = _weighted(evidence, USUAL_MISFIT)
+    state, weight = refine(state, replace(weighted, outlines=None), LOOSE, _places_held, FAR[:6])
+    return _judged(state, evidence, weighted, weight)
+
+
+def farther(
+    positions: Float[np.ndarray, "photos 3"], evidence: Evidence, times: float
+) -> Float[np.ndarray, "photos 3"]:
+    """Return the lights moved as outlines do not see it, the middle one so many times as far from the eye; world.
+
+    A perspectivity that keeps the ground's points and the eye turns one object, its shadows and its outline into
+    another's [Kriegman and Belhumeur, What shadows reveal about object structure, J. Opt. Soc. Am. A 18 (2001)].
+    """
+    terms = evidence.outlines
+    assert terms is not None
+    ground = np.array([0.0, 0.0, terms.ground])
+    above, eye = positions - ground, terms.eye - ground
+    share = (1 / times - 1) / np.median(above[:, 2])
+    across = 1 + share * above[:, 2:]
+    moved = (above + share * above[:, 2:] * eye) / np.maximum(across, NEAR_INFINITY)
+    return np.where((across > NEAR_INFINITY) & (moved[:, 2:] > LAMP), moved, above) + ground
 
 
 def _best_of_each(best: _Found, found: Sequence[_Found], evidence: Evidence) -> Flashlights:
@@ -91,7 +144,7 @@ def _best_of_each(best: _Found, found: Sequence[_Found], evidence: Evidence) -> 
     assert terms is not None
     albedo = (evidence.log_grey - log_irradiance(state, evidence) - cell_residuals(state, evidence, fit.weight))[0]
     ground = fit.weight.sum(0) > 0
-    cells = (evidence.weight > 0).sum(1) / ALIKE
+    cells = (evidence.weight > 0).sum(1) / _alike(evidence)
     costs, trials = [], []
     for one in found:
         trial = replace(one[1].flashlights, beam=state.beam, ambient=state.ambient, aim=state.aim)
@@ -119,13 +172,13 @@ def _best_of_each(best: _Found, found: Sequence[_Found], evidence: Evidence) -> 
     )
 
 
-def _pass(state: Flashlights, evidence: Evidence, misfit: float) -> _Found:
+def _pass(state: Flashlights, evidence: Evidence, misfit: float, blurs: Float[np.ndarray, " blurs"]) -> _Found:
     """Fit with outlines that are blurred at first."""
     assert evidence.outlines is not None
     weighted = _weighted(evidence, misfit)
-    for blur in BLURS:
-        blurred = replace(weighted, outlines=replace(evidence.outlines, blur=blur))
-        state = refine(state, blurred, LOOSE, _wall_held, FAR[:PER_BLUR])[0]
+    for blur in blurs:
+        blurred = replace(weighted, outlines=replace(evidence.outlines, blur=float(blur)))
+        state = refine(state, blurred, LOOSE, _tangent, FAR[:PER_BLUR])[0]
     return _settled(state, evidence, misfit)
 
 
@@ -175,23 +228,29 @@ def _as_pictured(fit: FlashlightFit, evidence: Evidence) -> FlashlightFit:
 def _posteriors(found: Sequence[_Found], evidence: Evidence) -> Float[np.ndarray, " found"]:
     """Return the negative log posteriors of fits to the same evidence, up to a constant that they share.
 
-    The shading counts as cells whose errors are independent, as many as in the fits themselves: log(misfit) for each.
+    The shading counts as cells whose errors are independent, as many as in the fits themselves: log(misfit) for each. A
+    wall pays for its terms [Schwarz, Estimating the Dimension of a Model, Annals of Statistics 6 (1978)].
     """
     misfit = np.maximum([one[2] for one in found], NO_GROUND)
-    cells = (evidence.weight > 0).sum() / ALIKE
-    return np.array([one[0] for one in found]) + cells * np.log(misfit)
+    cells = (evidence.weight > 0).sum() / _alike(evidence)
+    walls = np.array([one[1].flashlights.wall[2] > 0 for one in found])
+    return np.array([one[0] for one in found]) + cells * np.log(misfit) + walls * WALL_TERMS / 2 * np.log(cells)
 
 
 def _settled(start: Flashlights, evidence: Evidence, misfit: float) -> _Found:
     """Refine a state near the answer; misfit: of the shading, log units, by which its cells are weighted."""
-    terms = evidence.outlines
-    assert terms is not None
     weighted = _weighted(evidence, misfit)
-    flashlights, weight = refine(start, weighted, LOOSE, _wall_held, FAR[:8] + NEAR)
+    flashlights, weight = refine(start, weighted, LOOSE, _tangent, FAR[:8] + NEAR)
+    return _judged(flashlights, evidence, weighted, weight)
+
+
+def _judged(flashlights: Flashlights, evidence: Evidence, weighted: Evidence, weight: Samples) -> _Found:
+    """Return a state as a fit, with the cost of its outlines and the misfit of its shading; weight: of its samples."""
+    assert evidence.outlines is not None
     misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
     return (
-        terms.cost(flashlights.positions) if (weight > 0).any() else LOST,
-        FlashlightFit(flashlights, _weighted(evidence, misfit), weight, LOOSE, _wall_held),
+        evidence.outlines.cost(flashlights.positions) if (weight > 0).any() else LOST,
+        FlashlightFit(flashlights, _weighted(evidence, misfit), weight, LOOSE, _tangent),
         misfit,
     )
 
@@ -204,12 +263,18 @@ def _trusted(evidence: Evidence) -> Evidence:
 
 def _weighted(evidence: Evidence, misfit: float) -> Evidence:
     """Weight all photos' cells as their misfit (log units) and their likeness allow."""
-    trust = (NOISE / max(misfit, NOISE)) ** 2 / ALIKE
+    trust = (NOISE / max(misfit, NOISE)) ** 2 / _alike(evidence)
     return replace(evidence, weight=evidence.weight * trust)
 
 
+def _alike(evidence: Evidence) -> float:
+    """Return how many ground cells are wrong together."""
+    cells = (evidence.weight > 0).sum(1)
+    return max(float(np.median(cells[cells > 0])) / TELLS, 1.0) if cells.any() else 1.0
+
+
 def _held(
-    places: Float[np.ndarray, "photos 3"], evidence: Evidence, like: Flashlights | None, wall: Wall = NO_WALL
+    places: Float[np.ndarray, "photos 3"], evidence: Evidence, like: Flashlights | None
 ) -> tuple[Flashlights, Samples]:
     """Fit beam, aims and powers with the places held; return also the samples' weights.
 
@@ -220,22 +285,24 @@ def _held(
     if like is not None:
         return refine(replace(like, positions=places), evidence, LOOSE, _places_held, FAR[:2] + NEAR)
     beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS + RING_TERMS)]
-    state = Flashlights(places, np.repeat(centre[None], n, 0), np.zeros(n), beam, START_AMBIENT, centre, wall)
+    state = Flashlights(places, np.repeat(centre[None], n, 0), np.zeros(n), beam, START_AMBIENT, centre)
     for _ in range(AIM_ROUNDS):
         state, weight = refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)
         state = looked_for_aims(state, evidence, weight)
     return refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)
 
 
-def _wall_held(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
-    """Return free_tangent without the wall: few cells, trusted little, would take any wall for the lights' distance."""
+def _tangent(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
+    """Return free_tangent, without the wall where there is none: one is found from near its place only."""
     basis = free_tangent(flashlights)
+    if flashlights.wall[2] > 0:
+        return basis
     last = basis.shape[1] - 3  # the mean aim
     return np.delete(basis, np.arange(last - WALL_TERMS, last), axis=1)
 
 
 def _places_held(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
-    basis = _wall_held(flashlights)
+    basis = _tangent(flashlights)
     n, free = len(flashlights.positions), flashlights.per_flashlight() - 1
     columns = np.arange(basis.shape[1])
     return basis[:, (columns >= free * n) | (columns % free >= 3)]

@@ -61,7 +61,7 @@ def with_outlines(
     Args:
         evidence: of the used photos, before any fit.
         photos: which of the stack these are.
-        by_shading: what shading alone gives, world; some may be far off. Its wall is kept.
+        by_shading: what shading alone gives, world; some may be far off.
         edges: where the ground ends, world: no shadow beyond them is looked at.
         cues: photos from the side, a height: they fix the numbers that outlines leave free.
     """
@@ -72,11 +72,11 @@ def with_outlines(
         return None
     starts = [*shadow_starts(terms.maps, shadows.object_mask, posed_camera), by_shading.positions]
     cells = replace(_lit_cells(evidence, shadows, posed_camera), outlines=terms)
-    fit = searched(starts, cells, by_shading.wall)
+    fit = searched(starts, cells)
     wide = _terms(coarse, field, shadows, posed_camera, cues, True) if _at_odds(fit, terms) > OUTLINES_WRONG else None
     if wide is not None and _at_odds(fit, wide) < REPAIRED * _at_odds(fit, terms):
         terms = wide
-        fit = searched([fit.flashlights.positions], replace(cells, outlines=wide), by_shading.wall)
+        fit = searched([fit.flashlights.positions], replace(cells, outlines=wide))
     if _ground(fit) < MIN_GROUND / THIN:
         return None
     # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share

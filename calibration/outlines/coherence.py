@@ -42,12 +42,14 @@ def residuals(
     lights: Float[np.ndarray, "photos 3"],
     eye: Float[np.ndarray, "3"],
     used: Bool[np.ndarray, " photos"],
+    blur: float = 1.0,
 ) -> Residuals:
     """Return the emptiness of all rays.
 
     Args:
         lights: positions, world, z above the ground; eye: the camera's centre likewise.
         used: photos that take part.
+        blur: factor of an outline's sigma: what is far below it is not looked for.
     """
     from calibration.outlines.coherence_kernels import least_empty  # numba: help and refusals do not wait for it
 
@@ -60,7 +62,7 @@ def residuals(
     soft = np.append(softness(maps, lights), 0.0)
     where = _where(maps, views, takes_part.astype(np.uint8), soft)
     first = maps.first_height[chosen]
-    least_empty(starts, owner, *where, TALLEST * maps.size, FINE * maps.pixel, first, emptiness, height, by)
+    least_empty(starts, owner, *where, TALLEST * maps.size, FINE * blur * maps.pixel, first, emptiness, height, by)
     maps.first_height[chosen] = first
     light, h = views[owner], height[:, None]
     at = np.concatenate([starts + (light[:, :2] - starts) * h / light[:, 2:], h], 1)

@@ -121,6 +121,6 @@ class OutlineTerms:
         for before, at, found in self._looks:  # cost and rows of one state, one after the other
             if np.array_equal(before, used) and np.array_equal(at, lights):
                 return found
-        found = residuals(self.maps, lights, self.eye - lift, used)
+        found = residuals(self.maps, lights, self.eye - lift, used, self.blur)
         self._looks[:] = [(used, lights, found), *self._looks[: LOOKS - 1]]
         return found
