@@ -8,7 +8,7 @@ import torch
 from synthetic import BALL, HEAP, Box, Look, Sphere, Truth, render
 
 from calibration.ground.shadow_reach import most_height, shadow_reach
-from reconstruct.labels.field_ground_test import _told, label_ground
+from reconstruct.labels.field_ground_test import label_ground
 from reconstruct.labels.ground_test import test_ground as by_the_lights
 from reconstruct.labels.photometric_stereo import label_object, with_free_powers
 from reconstruct.scene import Scene, ground_points
@@ -131,15 +131,3 @@ def test_an_object_nearly_black_is_no_ground_in_shadow(off):
     assert (found.confidence.numpy() * truth.mask)[:, found.mask.numpy() > 0.5].max() < 0.05  # no shadows on it
     moved = label_ground(replace(scene, lights=scene.lights * torch.tensor([1.02, 1.02, 1.02, 1.0])), found)
     assert torch.equal(moved.mask, found.mask)
-
-
-@pytest.mark.parametrize("explained", [1.0, 0.95, 0.5, 0.05])
-def test_the_lights_model_counts_as_much_as_it_explains_of_the_picture(explained):
-    """What it calls object is one where it explains the rest, and may be ground where it explains little."""
-    tested = by_the_lights(render(HEAP, LOOK)[0])
-    known, mask = tested.mask_confidence > 0, tested.mask > 0.5
-    less, odds = (_told(replace(tested, explained=one)) for one in (0.7 * explained, explained))
-    assert np.isfinite(odds).all() and not odds[~known].any()
-    assert odds[mask & known].min() >= 0 >= odds[~mask & known].max()
-    assert odds[mask & known].min() >= less[mask & known].max()
-    assert (explained > 0.2) == (odds[mask & known].min() > 0.2)

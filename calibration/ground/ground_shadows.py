@@ -40,14 +40,10 @@ def find_shadows(field: GroundField) -> GroundShadows:
     return bare_ground(field).shadows
 
 
-def bare_ground(field: GroundField, hint: Float[np.ndarray, "height width"] | float = 0.0) -> BareGround:
-    """Return the shadows and the object, and the ground under both as far as the photos tell it.
-
-    Args:
-        hint: see object_and_ground.
-    """
+def bare_ground(field: GroundField) -> BareGround:
+    """Return the shadows and the object, and the ground under both as far as the photos tell it."""
     seam = None if field.beyond is None else _seam(field.beyond)
-    found = object_and_ground(field, seam, hint)
+    found = object_and_ground(field, seam)
     likelihood = cv2.GaussianBlur(found.brightness, (0, 0), 0.7)
     if field.beyond is not None:
         likelihood = np.where(field.beyond | seam, np.float32(ODDS), likelihood)
