@@ -15,7 +15,7 @@ from reconstruct.run_folder.folder import Progress
 from reconstruct.run_folder.progress import progress
 from reconstruct.stored_run.refusal import refuse_no_run
 from shadowgraph.options import Flag, Given
-from viewer.report.numbers import FORMATS
+from viewer.report.formats import FORMATS
 
 RunFolder = Annotated[Positional[Path], arg(metavar="RUN")]
 FORMAT_NAMES = ", ".join(FORMATS)

@@ -66,7 +66,7 @@ from pathlib import Path
 import torch
 torch.set_num_threads(1)
 from capture.files import atomic
-from reconstruct.solve import checkpoint_file
+from reconstruct.solve import checkpoint as checkpoint_file
 sys.path.insert(0, sys.argv[2])
 from test_crash import store, stored
 

@@ -24,7 +24,7 @@ from reconstruct.render import relight, studio
 from reconstruct.render.g_buffer import seen_material
 from reconstruct.render.studio import studio_of, turntable
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.report.numbers import FORMATS
+from viewer.report.formats import FORMATS
 
 SMALL = ExportOptions(faces=800, texture=128, width=160, frames=3, lamp_size=0.0)
 

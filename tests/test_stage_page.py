@@ -27,7 +27,7 @@ from reconstruct.render.relight import lit_share, relight
 from reconstruct.render.studio import FOCAL_HEIGHTS, Studio, looking_at, studio_of, towards
 from reconstruct.stored_run.stage_document import EMPTY, save_stage_document
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.report.numbers import FORMATS
+from viewer.report.formats import FORMATS
 from viewer.stage import page as stage_page_module
 
 WIDTH, HEIGHT = 320, 240

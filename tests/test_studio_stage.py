@@ -10,7 +10,7 @@ from studio_client import Client, served
 from reconstruct.export.export import export
 from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
 from reconstruct.stored_run.stage_pack import STAGE_PACK
-from viewer.report.numbers import FORMATS
+from viewer.report.formats import FORMATS
 from viewer.stage.files import StageFiles
 
 PAGE, DOCUMENT = "/stage/runs/heap/", "/stage/runs/heap/stage.json"

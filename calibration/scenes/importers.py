@@ -3,7 +3,6 @@
 import importlib
 import pkgutil
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 from calibration.known_scene import Importer, KnownScene
@@ -19,7 +18,6 @@ BOARD, SETTINGS = "board", "session.toml"
 OF_A_CAPTURE = (SETTINGS, BOARD)  # what a capture of ours has and no other layout; lists of lights may lie by it
 
 
-@cache
 def importers() -> tuple[Importer, ...]:
     """Return the importers of other programs' layouts: IMPORTER of every module of this package that has one."""
     package = importlib.import_module(__name__.rpartition(".")[0])

@@ -1,7 +1,4 @@
-"""The parts of the report that are numbers and drawings: camera, lights, fit, cost. Each is "" without its input.
-
-FORMATS with the page in one file: everything that the command and the page can save a finished run as.
-"""
+"""The parts of the report that are numbers and drawings: camera, lights, fit, cost. Each is "" without its input."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,24 +11,11 @@ from calibration.calibration import Calibration
 from calibration.light import Light
 from reconstruct.check.light_coverage import widest_gap
 from reconstruct.check.readiness import WIDE_GAP
-from reconstruct.export.formats import FORMATS, Format, add_format
 from reconstruct.run_folder.forecast import STAGE_NAMES, duration_text
 from viewer.display.run_follower import loss_curves, residual_text
 from viewer.report import document as doc
 from viewer.report.figures import coverage, curves, lights_from_above
 
-__all__ = ["FORMATS"]
-add_format(
-    "html",
-    Format(
-        ".html",
-        "A page to send to somebody",
-        "One file: the light follows the pointer, no server is needed.",
-        "viewer.stage.page:write_page",
-        "viewer.stage.page:read_page",
-    ),
-    after="3mf",
-)
 EXPLANATION = (
     "While the surface is fitted, uncertain lights may move to fit the shadows. The moved lights are kept only if they "
     "explain shadows that were set aside for a test better than the first ones do."

@@ -14,7 +14,7 @@ from typing import Any
 from capture.errors import CaptureError
 from capture.files.regular import is_own_folder, is_regular
 from capture.files.title import TITLE, title_of
-from viewer.report.numbers import FORMATS
+from viewer.report.formats import FORMATS
 from viewer.studio.folder import StudioFolder
 from viewer.studio.helper import Helper
 

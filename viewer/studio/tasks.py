@@ -122,7 +122,7 @@ def save(
 ) -> dict[str, str]:
     """Write a finished run as another kind of file into the folder `out`; return the file's name and what it holds."""
     from reconstruct.export.export import ExportOptions, as_one_file, default_file, export
-    from viewer.report.numbers import FORMATS
+    from viewer.report.formats import FORMATS
 
     assert name in FORMATS
     folder = Path(out)
