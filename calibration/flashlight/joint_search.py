@@ -48,6 +48,7 @@ FARTHER = (0.5, 0.6, 0.72, 0.85, 1.18, 1.4, 1.65, 2.0)  # along what outlines le
 ROUNDS = 3  # of other walls and distances, at most
 TRIED = 4  # of a round's: those that are fitted
 NEAR_INFINITY = 0.05  # a light that would be moved 20 times as far stays
+# tried first: as near as a wall behind a thing stands (mm), of middle grey; the fit moves them
 WALLS = tuple(np.array([azimuth, np.log(hand.NEAREST * 1.4), 0.5]) for azimuth in np.arange(8) * np.pi / 4)
 CONTRASTS = (1.1, 1.0, 0.9, 0.8, 0.7)  # of log brightness in the picture over that in the scene, that are tried
 CONTRAST_WIDTH = 0.1  # prior sigma of its logarithm about 0: phones lift whole regions that are dark
@@ -75,10 +76,10 @@ def searched(starts: Sequence[Float[np.ndarray, "photos 3"]], evidence: Evidence
         LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", number + 1, len(starts) + 1)
         state = _held(one, _weighted(trusted, USUAL_MISFIT), None)[0]
         found += [_pass(state, trusted, USUAL_MISFIT, blurs) for blurs in BLURS]
-    best = found[int(_posteriors(found, trusted).argmin())]
+    best = _likeliest(found, trusted)
     LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", len(starts) + 1, len(starts) + 1)
     found.append(_pass(_best_of_each(best, found, evidence), trusted, best[2], BLURS[0]))
-    found += _elsewhere(found[int(_posteriors(found, trusted).argmin())], trusted)
+    found += _elsewhere(_likeliest(found, trusted), trusted)
     posterior = _posteriors(found, trusted)
     best = found[int(posterior.argmin())]
     places = np.stack([one[1].flashlights.positions for one in found])
@@ -102,7 +103,7 @@ def _elsewhere(best: _Found, evidence: Evidence) -> list[_Found]:
         tried += [_shaded(best, one, state.wall, evidence) for one in places]
         order = _posteriors(tried, evidence).argsort()[:TRIED]
         found += [_settled(tried[k][1].flashlights, evidence, best[2]) for k in order]
-        before, best = best, [best, *found][int(_posteriors([best, *found], evidence).argmin())]
+        before, best = best, _likeliest([best, *found], evidence)
         if best is before:
             break
     return found
@@ -221,8 +222,7 @@ def _as_pictured(fit: FlashlightFit, evidence: Evidence) -> FlashlightFit:
     """Fit beam, aims and powers to the evidence with the places held, so that they say what the pictures show."""
     weighted = _weighted(evidence, USUAL_MISFIT)
     flashlights, weight = _held(fit.flashlights.positions, weighted, fit.flashlights)
-    misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
-    return replace(fit, flashlights=flashlights, weight=weight, evidence=_weighted(evidence, misfit))
+    return replace(_judged(flashlights, evidence, weighted, weight)[1], between=fit.between)
 
 
 def _posteriors(found: Sequence[_Found], evidence: Evidence) -> Float[np.ndarray, " found"]:
@@ -235,6 +235,10 @@ def _posteriors(found: Sequence[_Found], evidence: Evidence) -> Float[np.ndarray
     cells = (evidence.weight > 0).sum() / _alike(evidence)
     walls = np.array([one[1].flashlights.wall[2] > 0 for one in found])
     return np.array([one[0] for one in found]) + cells * np.log(misfit) + walls * WALL_TERMS / 2 * np.log(cells)
+
+
+def _likeliest(found: Sequence[_Found], evidence: Evidence) -> _Found:
+    return found[int(_posteriors(found, evidence).argmin())]
 
 
 def _settled(start: Flashlights, evidence: Evidence, misfit: float) -> _Found:
