@@ -80,6 +80,11 @@ class PhotoColours:
         return np.asarray(seen)[KDTree(vertices[faces]).query(vertices)[1]]
 
 
+# An atlas stays until the next one is made: one that is destroyed while its worker falls asleep waits for it forever
+# (xatlas 0.0.11, TaskScheduler::~TaskScheduler wakes its worker without holding the worker's lock).
+_last_atlas: list[xatlas.Atlas] = []
+
+
 @dataclass(frozen=True)
 class TexturedMesh:
     """A mesh with texture coordinates and its pictures; world frame."""
@@ -113,6 +118,7 @@ def unwrap(
     atlas.add_mesh(np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32))
     atlas.generate(chart, pack)
     origin, faces, uv = atlas[0]
+    _last_atlas[:] = [atlas]
     # A packed atlas may be slightly larger than requested, and not square; xatlas returns uv relative to its size.
     texels = uv * [atlas.width, atlas.height]
     return origin.astype(np.int64), faces.astype(np.int64), texels / max(atlas.width, atlas.height)
