@@ -26,14 +26,14 @@ NO_CHECK = {"is_old": True, "numbers": {"photos": 9, "photos_used": 9}}
         (
             [*LIT_36, photo("lit", drop=True), photo("board", drop=True)],
             NO_CHECK,
-            "38 photos: 37 under the flashlight, 1 of the board, 2 left out",
+            "38 photos: 36 under the flashlight, 2 left out",
             "Leave 2 out and go on",
             "36 of 37 photos",
         ),
         (
             [*LIT_36, *BOARD_9],
             {"is_old": False, "numbers": {"photos": 36, "photos_used": 35}},
-            "45 photos: 36 under the flashlight, 9 of the board, 1 left out",
+            "45 photos: 35 under the flashlight, 9 of the board, 1 left out",
             "Leave it out and go on",
             "35 of 36 photos",
         ),
@@ -68,6 +68,6 @@ def test_the_studio_counts_what_the_coach_saw_and_names_a_copy_on_arrival(tmp_pa
         found = row()
     bad = {one["name"].split("/")[-1]: one["remarks"][0][0] for one in found["photos"] if one["drop"]}
     assert bad == {LIT[0]: "unreadable", f"{Path(LIT[1]).stem} (1).jpg": "copy"}
-    assert found["counts"]["words"] == "8 photos: 7 under the flashlight, 1 of the board, 2 left out"
+    assert found["counts"]["words"] == "8 photos: 5 under the flashlight, 1 of the board, 2 left out"
     assert found["counts"]["start"] == "Leave 2 out and go on"
     assert found["counts"]["uses"] == "5 of 7 photos under the flashlight will be used."

@@ -167,7 +167,7 @@ def test_doubts_and_dropped_photos_are_reasons(truth, cover):
     findings = [Finding(Path(name), "blurred", "shaken", 0.4, 0.8, True) for name in names[:9]]
     lights = tuple(replace(x, used=x.photo not in names[:9]) for x in truth.calibration.lights)
     found = judge(replace(truth.calibration, lights=lights), findings, cover, ("the tone curve is doubtful",))
-    assert "17 of 26 photos can be used (9 blurred)" in found.reasons
+    assert "17 of 26 photos can be used (blurred: 9)" in found.reasons
     assert "the tone curve is doubtful" in found.reasons
 
 

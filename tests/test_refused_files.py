@@ -1,6 +1,7 @@
 """A file that is not taken is said once, in words that say what to do, and the sentence can be dismissed."""
 
 import io
+import sys
 import zipfile
 
 import pytest
@@ -9,6 +10,10 @@ from studio_client import served
 from test_intake import jpeg
 from test_studio import capture_in
 from test_studio_browser import DESKTOP, PHONE, browser, opened  # noqa: F401  a fixture
+from waiting import wait_until
+
+from capture.errors import CaptureError
+from capture.intake.arrivals import refuse_size
 
 
 def a_zip(**files: bytes) -> bytes:
@@ -44,6 +49,49 @@ def test_a_refused_file_is_said_without_the_servers_path_or_a_folder_that_the_se
     assert refused
     for one in refused:
         assert str(tmp_path) not in one["why"] and "from the folder" not in one["why"], one["why"]
+
+
+@pytest.mark.parametrize(
+    "said",
+    ["none of the photos in {} shows a board.", "{}/IMG_1.jpg cannot be read.", "{}/photos: 1 photo. Take more."],
+)
+def test_a_run_that_failed_says_why_without_the_servers_path(tmp_path, said):
+    (tmp_path / "program.py").write_text(
+        f"import sys; print('shadowgraph: ' + {said!r}.format(sys.argv[2])); sys.exit(2)"
+    )
+    capture_in(tmp_path / "studio", "vase")
+    with served(tmp_path / "studio", (sys.executable, str(tmp_path / "program.py"))) as (_, _, owner):
+        owner.ok("start", key="vase", preset="draft")
+
+        def runs():
+            return owner.get("/api/state")[1]["cards"][0]["runs"]
+
+        wait_until(lambda: [run["state"] for run in runs()] == ["failed"])
+        (run,) = runs()
+    assert str(tmp_path) not in run["sentence"] and said.split("}")[1].strip("/") in run["sentence"]
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.parametrize("count", [1, 4, 6])
+def test_photos_that_will_not_be_used_are_named_and_counted(browser, tmp_path, count):  # noqa: F811
+    capture = capture_in(tmp_path, "vase")
+    for number in range(10, 10 + count):
+        (capture / "photos" / f"IMG_{number}.jpg").write_bytes(jpeg(number)[:-200])
+    with served(tmp_path) as (_, _, owner):
+        tab, _ = opened(browser, owner, PHONE)
+        tab.goto(f"http://127.0.0.1:{owner.port}/#/capture/vase")
+        tab.wait_for_selector(f"button:has-text('Leave {'it' if count == 1 else count} out and go on')")
+        said = tab.inner_text("p:has-text('Will not be used')")
+    assert said.count("(unreadable)") == min(count, 4) and ("and 2 more." in said) == (count == 6)
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "words"), [("a.jpg", 0, "is empty"), ("a.mp4", 0, "is empty"), ("a.jpg", 10**12, "at most")]
+)
+def test_a_file_without_bytes_or_with_too_many_is_refused_in_words_that_fit(tmp_path, name, size, words):
+    with pytest.raises(CaptureError, match=words):
+        refuse_size(name, size, tmp_path)
 
 
 @pytest.mark.browser

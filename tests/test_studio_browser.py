@@ -185,7 +185,7 @@ def test_the_coach_speaks_once_and_shakes_for_a_photo_that_is_bad(browser, tmp_p
             return [said, shaken.length];
         }"""
         )
-    assert said == [["IMG_1.jpg: blurred. Take it again. Next: lower, from the left.", "Done."], 1]
+    assert said == [["IMG_1.jpg: blurred. It will not be used. Next: lower, from the left.", "Done."], 1]
 
 
 @pytest.mark.slow

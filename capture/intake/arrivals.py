@@ -65,8 +65,10 @@ def refuse_size(name: str, size: int, folder: Path) -> None:
         CaptureError: it is; or a capture does not take such a file.
     """
     most = largest_size(name)
-    if not 0 < size <= most:
-        raise CaptureError(f"{name} has {size / 1e6:,.0f} MB; more than 0 and at most {most / 1e6:,.0f} MB are taken.")
+    if size <= 0:
+        raise CaptureError(f"{name} is empty. Copy it again from where it was taken.")
+    if size > most:
+        raise CaptureError(f"{name} has {size / 1e6:,.0f} MB; at most {most / 1e6:,.0f} MB are taken.")
     refuse_full_disk(size, folder)
 
 

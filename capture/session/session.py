@@ -339,8 +339,8 @@ def _refuse_few_loose(sound: SoundPhotos, folder: Path) -> None:
             "(JPEG, PNG, TIFF, HEIC, AVIF, EXR or RAW), or a clip of the moving flashlight (MP4, MOV, MKV or WebM)."
         )
     raise CaptureError(
-        f"{count} photos found in {folder}, at least {FEWEST_LIT + 1} are needed: the board in room light, "
-        f"and {FEWEST_LIT} lit by the flashlight ({ADVISED_LIT} or more advised). Take more photos."
+        f"{count} photo{'s' * (count != 1)} found in {folder}, at least {FEWEST_LIT + 1} are needed: the board in room "
+        f"light, and {FEWEST_LIT} lit by the flashlight ({ADVISED_LIT} or more advised). Take more photos."
     )
 
 

@@ -46,7 +46,8 @@ class Readiness:
         used, photos = self.facts["photos_used"], self.facts["photos"]
         if len(self.reasons) == 0:
             return f"Good: {used} of {photos} photos can be used, and light came from all sides."
-        more = f" (and {len(self.reasons) - 1} more)" if len(self.reasons) > 1 else ""
+        further = len(self.reasons) - 1
+        more = f", and for {further} more reason{'s' * (further > 1)}" if further else ""
         return f"{self.grade.capitalize()}: {self.reasons[0]}{more}."
 
     def document(self) -> dict[str, Any]:
@@ -155,14 +156,14 @@ def judge_photos(say: Judge, facts: dict[str, Any], findings: Sequence[Finding],
     """Judge the number of photos, and what was found in them."""
     used, photos = facts["photos_used"], facts["photos"]
     dropped = Counter(finding.kind for finding in findings if finding.drop and finding.role == "lit")
-    why = ", ".join(f"{count} {kind}" for kind, count in dropped.most_common())
+    why = ", ".join(f"{kind}: {count}" for kind, count in dropped.most_common())
     of_all = f"{used} of {photos} photos can be used" + (f" ({why})" if why else "")
     if used < FEWEST_LIT:
         say("hopeless", f"{of_all}, {FEWEST_LIT} are needed at least", MORE_LIGHTS)
     elif used < ADVISED_LIT:
         say("poor", f"{of_all}, {ADVISED_LIT} or more are advised", MORE_LIGHTS)
     elif used < (1 - MANY_DROPPED) * photos:
-        say("fair", of_all, "Shoot the photos that were left out again.")
+        say("fair", of_all, MORE_LIGHTS)
     elif used < PLENTY and not is_part:
         say("fair", f"{used} photos: {PLENTY} or more show more of the shape", MORE_LIGHTS)
     _judge_tripod(say, used, [finding for finding in findings if finding.kind == BOARD_OFF])

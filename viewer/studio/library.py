@@ -136,6 +136,8 @@ class Library:
         preset = str((manifest.get("config") or {}).get("preset") or (job.preset if job else ""))
         mesh = report.get("mesh") or {}
         state, sentence = _state(job, now.is_running, now.is_finished, now.title)
+        if job is not None:
+            sentence = without_folder(sentence, Path(job.task.capture), "this capture")
         return {
             "key": key,
             "title": title_of(path, *([Path(job.task.capture)] if job else [])),
@@ -242,15 +244,17 @@ def counts_of(photos: Sequence[Mapping[str, Any]], check: Mapping[str, Any]) -> 
         check: the newest verdict; its numbers count unless photos have changed since.
 
     Returns:
-        `words`; `lit`, photos under the flashlight, and `used`, how many of them a run will use; `left_out`, photos of
-        any role that it will not use; `start`, what the button says that starts one; `uses`, the sentence beside it.
+        `words`, whose numbers add up; `lit`, photos under the flashlight, and `used`, how many of them a run will use;
+        `left_out`, photos of any role that it will not use; `start`, what the button says that starts one;
+        `uses`, the sentence beside it.
     """
     numbers = {} if check.get("is_old") else check.get("numbers", {})
     lit = [photo for photo in photos if photo["role"] == "lit"]
     total = int(numbers.get("photos", len(lit)))
     used = int(numbers.get("photos_used", sum(not photo["drop"] for photo in lit)))
     left_out = total - used + sum(bool(photo["drop"]) for photo in photos if photo["role"] != "lit")
-    counts = {role: sum(photo["role"] == role for photo in photos) for role in ROLES} | {"lit": total}
+    kept = [photo["role"] for photo in photos if not photo["drop"]]
+    counts = {role: kept.count(role) for role in ROLES} | {"lit": used}
     told = [f"{counts[role]} {words}" for role, words in ROLES.items() if counts[role]]
     unseen = sum(not photo["role"] and not photo["looked"] for photo in photos)
     told += [f"{unseen} not looked at yet"] if unseen else []

@@ -2,7 +2,7 @@
 
 import { h } from "./dom.js";
 import { dome } from "./hemisphere.js";
-import { complaint, picked, sending } from "./upload.js";
+import { complaint, picked, sending, unused } from "./upload.js";
 import { voice } from "./voice.js";
 
 /** The view of one phone; `phone` is what all views share: its state, its sender, and how to draw again. */
@@ -26,7 +26,7 @@ export function album(phone) {
         sender.open.length > 0 && h("p", { class: "small quiet" }, "Keep this page open. If the network drops, it goes on by itself.")),
       h("section", { class: "panel", "aria-live": "polite" },
         h("p", {}, `${state.counts.words}.`),
-        state.bad.length > 0 && h("p", { class: "warn" }, "Take again: ", state.bad.slice(-5).map((one) => `${one.name} (${one.remarks[0][0]})`).join(", ")),
+        state.bad.length > 0 && h("p", { class: "warn" }, unused(state.bad)),
         state.refused.length > 0 && h("p", { class: "bad" }, state.refused.slice(-3).map((one) => complaint(one.name, one.why)).join(" ")),
         check.sentence && h("p", { class: `verdict ${check.verdict}` }, check.sentence),
         !check.sentence && check.error && h("p", { class: "bad" }, check.error),

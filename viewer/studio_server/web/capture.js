@@ -4,10 +4,10 @@ import { PRESETS, about, ask as question, attempt, bytes, change, day, dialog, d
 import { boardOnScreen, printLink } from "./board.js";
 import { dome } from "./hemisphere.js";
 import { phones } from "./phones.js";
-import { Sender, complaint, dropped, picked, sending } from "./upload.js";
+import { Sender, complaint, dropped, picked, sending, unused } from "./upload.js";
 import { voice } from "./voice.js";
 
-const ROLES = { "": "found from the picture", board: "board", lit: "flashlight", light: "flashlight's phone", dark: "light off", side: "side photo" };
+const ROLES = { "": "find out", board: "board", lit: "flashlight", light: "flashlight's phone", dark: "light off", side: "side photo" };
 const FOLDERS = { board: "board/", lit: "photos/", light: "light/", dark: "dark/", side: "side/" };
 const senders = new Map(); // they go on while another view is shown
 
@@ -55,9 +55,10 @@ export function capture(name, again) {
       phone.panel(), sending(sender), row.stalled > 0 && stalled(row),
       row.refused.length > 0 && h("div", { class: "bad small" }, h("p", {}, "Not taken:"),
         h("ul", { class: "plain" }, row.refused.slice(-5).map((one) => h("li", {}, complaint(one.name, one.why), " ",
-          h("button", { onclick: () => attempt(async () => { await change("dismiss", { key: row.key, part: one.id }); again(); }) }, "Dismiss"))))),
+          h("button", { onclick: () => attempt(async () => { await change("dismiss", { key: row.key, part: one.id }); again(); }) }, "Dismiss")))),
+        row.refused.length > 5 && h("p", {}, `and ${row.refused.length - 5} more.`)),
       row.photos.length + row.clips.length > 0 && h("p", { class: "quiet" }, row.counts.words),
-      bad.length > 0 && h("p", { class: "warn" }, `Take again: ${bad.slice(0, 4).map((photo) => `${photo.name} (${photo.remarks[0][0]})`).join(", ")}`),
+      bad.length > 0 && h("p", { class: "warn" }, unused(bad)),
       row.clips.map((clip) => h("p", { key: clip }, `Clip: ${clip}`)),
       h("ul", { class: "photos" }, row.photos.map((photo) => thumb(row, photo))));
   }

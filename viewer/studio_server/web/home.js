@@ -69,7 +69,7 @@ export function home(_, again) {
       : card.count ? picture(`/api/picture?key=${key(card.key)}&v=${card.date}`, `Photo of ${card.title}`)
         : h("div", { class: "picture empty" }, card.kind === "capture" ? "No photos yet" : "No picture yet");
     const state = run && ["waiting", "running", "failed"].includes(run.state) && card.state !== "arriving" ? run.state
-      : card.state === "checked" && shown ? "finished" : card.state || (run && run.state);
+      : ["checked", "new"].includes(card.state) && shown ? "finished" : card.state || (run && run.state);
     return h("li", { class: "card", key: card.key },
       h("a", { class: "face", href: shown ? `#/run/${key(shown.key)}` : href, "aria-hidden": "true", tabindex: "-1" }, face),
       h("div", { class: "body" },

@@ -49,8 +49,8 @@ export function run(name, again) {
         (one.state === "running" || one.state === "waiting") && one.job && h("button", { onclick: () => queue(one, "stop") }, one.state === "running" ? "Stop and keep" : "Take out of the queue"),
         one.state === "running" && h("button", { onclick: () => inspect(one) }, "Watch it grow in 3D"),
         one.state === "waiting" && h("button", { onclick: () => queue(one, "first") }, "Next in line"),
-        (one.state === "failed" || one.state === "stopped") && one.job && h("button", { class: "main", onclick: () => queue(one, "again") }, "Go on where it stood"),
-        one.state === "failed" && photos && h("a", { class: "button", href: photos }, "Look at its photos")));
+        one.state === "failed" && photos && h("a", { class: "button main", href: photos }, "Look at its photos"),
+        (one.state === "failed" || one.state === "stopped") && one.job && h("button", { class: one.state === "stopped" ? "main" : "", onclick: () => queue(one, "again") }, "Go on where it stood")));
   }
 
   function result(one) {

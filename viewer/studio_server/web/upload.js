@@ -174,3 +174,9 @@ export function complaint(path, why) {
   const name = path.split("/").pop();
   return why.startsWith(name) ? why : `${name}: ${why}`;
 }
+
+/** Which photos will not be used, the newest by name: a copy needs no other photo, what is blurred does. */
+export function unused(photos) {
+  const named = photos.slice(-4).map((one) => `${one.name.split("/").pop()} (${one.remarks[0][0]})`);
+  return `Will not be used: ${named.join(", ")}${photos.length > named.length ? `, and ${photos.length - named.length} more` : ""}.`;
+}

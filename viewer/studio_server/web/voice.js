@@ -9,12 +9,12 @@ export function voice(again) {
   const told = new Set();
   let isLoud = false, said = "";
 
-  /** `bad`: [{name, remarks}], photos to take again, oldest first; `advice`: what to do next. */
+  /** `bad`: [{name, remarks}], photos that will not be used, oldest first; `advice`: what to do next. */
   function hear(bad, advice) {
     const fresh = bad.filter((one) => !told.has(one.name));
     if (fresh.length && navigator.vibrate && navigator.userActivation?.hasBeenActive) navigator.vibrate(SHAKE_MS); // browsers refuse it before a touch
     fresh.forEach((one) => told.add(one.name));
-    const wrong = bad.slice(-1).map((one) => `${one.name.split("/").pop()}: ${one.remarks[0][0]}. Take it again.`);
+    const wrong = bad.slice(-1).map((one) => `${one.name.split("/").pop()}: ${one.remarks[0][0]}. It will not be used.`);
     const words = [...wrong, advice].filter(Boolean).join(" ");
     if (!isLoud || !words || words === said) return;
     said = words;
