@@ -19,7 +19,7 @@ from calibration.outlines.coherence_kernels import BETTER
 from calibration.outlines.metric_cues import MetricCues
 from calibration.outlines.outline_maps import PIXEL_ERROR, TALLEST, outline_maps, with_cues
 from calibration.outlines.shadow_start import STARTS, shadow_starts
-from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
+from calibration.outlines.terms import DROP_OUTLINE, FALSE_SPOT, OutlineTerms
 from calibration.pose import Pose
 from calibration.side_view import SideView
 
@@ -196,9 +196,10 @@ def test_rows_are_derivatives_of_the_highlights_cost(ball):
             for sign in (1, -1)
         ]
         np.testing.assert_allclose(slope[spot] @ step, (moved[0] - moved[1]) / 2, rtol=1e-4, atol=1e-9)
-    value, _ = terms.rows(lights)
-    plain, _ = OutlineTerms(maps, EYE, 0.0, every, every).rows(lights)
-    assert len(value) == len(plain) + 2 * len(miss)
+    value, slopes = terms.rows(lights)
+    vote = 1 / (1 + (miss**2).sum(1, keepdims=True) / FALSE_SPOT**2)
+    np.testing.assert_allclose(value[-4:], (miss * vote).ravel())
+    np.testing.assert_allclose(slopes[-4:].reshape(2, 2, -1, 3)[[0, 1], :, owner], slope * vote[..., None])
 
 
 def test_starts_are_of_several_heights(ball):

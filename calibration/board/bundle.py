@@ -12,6 +12,7 @@ from calibration.board.board_pose import CORNER_SIGMA, plane_poses
 from calibration.board.corners import Corners
 from calibration.board.sheet import FLAT, FLATTEST, Sheet, Waves, nearest_corners, sheet_of, weigh_waves
 from calibration.camera import project_from
+from capture.checks.robust import cauchy
 
 FINEST_NOISE = 0.04  # px: the corners of good photos are this good; few residuals may look better by chance
 N_PINHOLE = 4  # log fx, log fy/fx, cx, cy; the numbers of the distortion follow
@@ -203,7 +204,7 @@ class _Problem:
         """Return the problem with noise and Cauchy's weights as the residuals at x say; known: number of unknowns."""
         distances = self.distances(x)
         noise = _noise(np.concatenate(distances), known, self.photos[0].across is not None)
-        return replace(self, noise=noise, weights=[1 / (1 + (d / (3 * noise)) ** 2) for d in distances])
+        return replace(self, noise=noise, weights=[cauchy((d / (3 * noise)) ** 2) for d in distances])
 
     def normal(self, x: Float[np.ndarray, " n"]) -> "_Normal":
         """Return the normal equations at x."""

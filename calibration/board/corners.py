@@ -12,6 +12,7 @@ from calibration.board.board import AnyBoard, Blank, Board, opencv_dictionary
 from calibration.board.lattice import find_lattices, flat_view
 from calibration.board.placement import place, placed_markers
 from calibration.board.sheet_edges import find_edges
+from capture.checks.robust import cauchy
 from capture.photos.photo import Photo, encode_srgb, read_photo
 
 Grey = UInt8[np.ndarray, "_ _"]  # height, width; a reduced copy may stand beside the photo in one signature
@@ -284,7 +285,7 @@ def _smooth(values: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], d
     fitted = np.zeros_like(values)
     for _ in range(10):
         distance = np.linalg.norm(values - fitted, axis=1)  # at first from the flat view, which no stray corner bends
-        root = 1 / np.sqrt(1 + (distance / max(2 * np.median(distance), 1e-6)) ** 2)[:, None]
+        root = np.sqrt(cauchy((distance / max(2 * np.median(distance), 1e-6)) ** 2))[:, None]
         fitted = (
             terms @ np.linalg.lstsq(np.vstack([terms * root, stiff]), np.vstack([values * root, rest]), rcond=None)[0]
         )

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from scipy import ndimage
 
 from calibration.board.board import Blank
+from capture.checks.robust import cauchy
 from capture.decode.exif import ORDINARY_FOCAL_35MM, focal_in_pixels
 from capture.photos.photo import decode_srgb
 
@@ -214,7 +215,7 @@ def _lines(
     level, slant = np.median(offsets, axis=1), np.zeros(len(offsets))
     off = offsets - level[:, None]
     for _ in range(LINE_ROUNDS):
-        weight = 1 / (1 + (off / OFF_LINE_PX) ** 2)
+        weight = cauchy((off / OFF_LINE_PX) ** 2)
         total, first, second = (weight * shares**k for k in range(3))
         moments = [part.sum(1) for part in (total, first, second)]
         values = (weight * offsets).sum(1), (weight * shares * offsets).sum(1)

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from calibration.ground.mirror_highlights import MirrorHighlights
 from calibration.outlines.coherence import Residuals, residuals
 from calibration.outlines.outline_maps import PIXEL_ERROR, OutlineMaps
+from capture.checks.robust import cauchy
 
 DROP_OUTLINE = 1.0  # px: right lights stay below 0.6
 SERIES = 0.3  # spread of log distances of a handheld light from the object, as an arm moves
@@ -36,7 +37,7 @@ class OutlineTerms:
         sigma = PIXEL_ERROR * self.maps.pixel * self.blur
         active = found.emptiness > 0
         size = found.emptiness[active] / sigma
-        root = 1 / np.sqrt((1 + size**2) * SAME)
+        root = np.sqrt(cauchy(size**2) / SAME)
         slopes = np.zeros((len(size), len(positions) + 1, 3))
         place = np.arange(len(size))
         slopes[place, order[found.owner[active]]] += found.d_owner[active] * (root / sigma)[:, None]
@@ -45,7 +46,7 @@ class OutlineTerms:
         toward = np.zeros((len(positions), len(positions), 3))
         toward[np.arange(len(positions)), np.arange(len(positions))] = arm / (arm**2).sum(1, keepdims=True) / SERIES
         miss, bend, owner = self._half_vectors(positions)
-        vote = 1 / (1 + (miss**2).sum(1) / FALSE_SPOT**2)
+        vote = cauchy((miss**2).sum(1) / FALSE_SPOT**2)
         bent = np.zeros((len(miss), 2, len(positions), 3))
         bent[np.arange(len(miss)), :, owner] = bend * vote[:, None, None]
         value = np.concatenate([root * size, far, (miss * vote[:, None]).ravel()])

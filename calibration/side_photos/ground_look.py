@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.posed_camera import PosedCamera
+from capture.checks.robust import column_spread, geman_mcclure
 
 DARKEST = 0.004  # linear: added nowhere, a floor before the logarithm; one step of 8-bit sRGB
 FLATTEST = 0.02  # least slope of a ray that is taken to meet the table
@@ -87,10 +88,10 @@ def ground_look(
     for _ in range(GAIN_ROUNDS):
         residual = raw - _smooth(raw, vote)
         off = residual[outside]
-        sigma = np.maximum(1.4826 * np.median(np.abs(off), axis=0), NARROWEST)
+        sigma = np.maximum(column_spread(off), NARROWEST)
         error = np.hypot(sigma, SHIFT * slope)
         size = np.sqrt(((residual / error) ** 2).mean(-1))
-        vote = (np.where(region, BELIEVED_INSIDE, 1.0) * known / (1 + (size / 2) ** 2) ** 2).astype(np.float32)
+        vote = (np.where(region, BELIEVED_INSIDE, 1.0) * known * geman_mcclure((size / 2) ** 2)).astype(np.float32)
     return GroundLook(np.where(known[..., None], residual, 0.0), np.hypot(sigma, SHIFT * slope), known, hidden)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from capture.checks.mixture import levels, usual_level
-from capture.checks.robust import spread
+from capture.checks.robust import cauchy, spread
 from capture.photos.channels import mean_of_channels
 from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
@@ -109,7 +109,7 @@ def excess(shadows: Shadows) -> Float[np.ndarray, " photos"]:
         place = (weight * (ratios - fitted[:, None])).sum(0) / total
         off = ratios - fitted[:, None] - place
         sigma = spread(off[asked]) + np.finfo(np.float32).eps
-        weight = np.where(asked, 1 / (1 + (off / (CUT * sigma)) ** 2), 0.0)
+        weight = np.where(asked, cauchy((off / (CUT * sigma)) ** 2), 0.0)
     more[known] = fitted[known] - np.median(fitted[known])
     return more
 

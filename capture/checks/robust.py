@@ -1,4 +1,4 @@
-"""Standard deviations and quantiles that a few wrong values do not change."""
+"""Standard deviations, quantiles and least squares that a few wrong values do not change."""
 
 import numpy as np
 from jaxtyping import Float
@@ -29,3 +29,13 @@ def column_quantile(values: Float[np.ndarray, "rows columns"], share: float) -> 
     below = np.floor(rank).astype(int)
     low, high = (np.take_along_axis(ordered, at[None], 0)[0] for at in (below, np.ceil(rank).astype(int)))
     return (low + (rank - below) * (high - low)).astype(values.dtype)
+
+
+def cauchy(squares: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+    """Weights of Cauchy's loss in reweighted least squares; squares: of errors over their width."""
+    return 1 / (1 + squares)
+
+
+def geman_mcclure(squares: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+    """Weights of Geman and McClure's loss, as in `cauchy`: what is far off has no vote."""
+    return 1 / (1 + squares) ** 2

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from capture.checks.robust import MAD_TO_SIGMA
+from capture.checks.robust import spread
 from reconstruct.appearance.brdf import LOBES, facing_reflectances, fresnel, lobes_and_factors, specular
 from reconstruct.scene import Scene, irradiance
 
@@ -132,7 +132,7 @@ def _reweighted(samples: Samples, is_glossy: bool) -> tuple[Float[Tensor, "lobes
             coefficients = _non_negative(equations, DOUBT * sigma**2 * float(weight.sum()))
         residual = [part.residual(weight[some], coefficients) for part, some in zip(parts, pixels, strict=True)]
         residual = torch.cat(residual)
-        sigma = MAD_TO_SIGMA * float(residual[samples.weight > 0].abs().median())
+        sigma = spread(residual[samples.weight > 0].numpy())
         weight = samples.weight * _trust(residual, sigma)
     return coefficients, sigma, float(residual[samples.weight > 0].square().mean())
 

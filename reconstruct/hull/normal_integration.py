@@ -12,6 +12,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import cg, spsolve
 
+from capture.checks.robust import geman_mcclure
+
 ROUNDS = 6  # of reweighting
 BREAK = 2.0  # pixels between the tangent planes of neighbours that are on different surfaces, before and after
 GUESSED = 2 * BREAK  # pixels of empty space before a depth that is a guess: its breaks are guesses, too
@@ -105,7 +107,7 @@ def integrate_within(
     t = t0 if behind is None else np.where(held | np.isnan(behind[where]), t0, behind[where])
     for wider in (*(GUESSED_WIDTHS if behind is None else ()), *(1.0 for _ in range(ROUNDS))):
         width = wider * BREAK
-        hold = tie * np.where(t < t0, 1, touching * _geman_mcclure((t - t0) / (width * chords.size)) + DUST)
+        hold = tie * np.where(t < t0, 1, touching * geman_mcclure(((t - t0) / (width * chords.size)) ** 2) + DUST)
         hold = np.where(held, THERE / chords.size**2, hold)
         t = _reweighted(chords.slope, np.zeros_like(chords.apart), chords.weight, width, hold, t0, t)
     return _spread(t, where)
@@ -206,14 +208,9 @@ def _reweighted(
     t: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:
     """Return t after a round of least squares with Geman-McClure weights of a width, and ties of `hold` to `held`."""
-    robust = weight * _geman_mcclure((slope @ t - apart) / width)
+    robust = weight * geman_mcclure(((slope @ t - apart) / width) ** 2)
     matrix = slope.T @ diags(robust) @ slope + diags(hold)
     return _solved(csc_matrix(matrix), slope.T @ (robust * apart) + hold * held, t)
-
-
-def _geman_mcclure(error: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return the weights of errors in units of their width."""
-    return 1 / (1 + error**2) ** 2
 
 
 def _spread(t: Float[np.ndarray, " n"], where: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:

@@ -24,6 +24,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from calibration.pose import Pose
+from capture.checks.robust import cauchy, geman_mcclure
 from capture.errors import ReconstructionError
 from reconstruct.fields import SolvedScene
 from reconstruct.lies.noise import mean_difference
@@ -199,14 +200,13 @@ class _Pairs:
 
     def losses(self, motion: Pose, width: float) -> Float[np.ndarray, " n"]:
         """Return each point's robust error in [0, 1]."""
-        square = (self.distances(motion) / width) ** 2
-        return square / (1 + square)
+        return 1 - cauchy((self.distances(motion) / width) ** 2)
 
     def fitted(self, motion: Pose, width: float, steps: int) -> Pose:
         """Return the motion after steps of reweighted least squares on the distances."""
         for _ in range(steps):
             phi, rows = self.signed(motion)
-            weight = 1 / (1 + (phi / width) ** 2) ** 2
+            weight = geman_mcclure((phi / width) ** 2)
             normal = (rows * weight[:, None]).T @ rows
             normal += 1e-6 * np.diag(np.diag(normal).clip(min=1e-12))
             step = -np.linalg.solve(normal, (rows * weight[:, None]).T @ phi)

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import block_diag
 
 from calibration.pose import Pose
+from capture.checks.robust import cauchy, geman_mcclure
 from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out
 from reconstruct.labels.supervision import SURE_ENOUGH, Supervision
 from reconstruct.lies.alignment import stepped
@@ -120,7 +121,7 @@ def _least_squares(
     Args:
         at: the unknowns, whose prior is 0 with one `sigma` (inf: none); CORRELATED rays count as one.
     """
-    weight = 1 / (1 + (now / WIDTH) ** 2) ** 2
+    weight = geman_mcclure((now / WIDTH) ** 2)
     normal = (slopes * weight[:, None]).T @ slopes
     prior = CORRELATED * float((weight * now**2).sum() / weight.sum()) / sigma**2
     normal += np.diag(prior) + 1e-9 * np.diag(np.diag(normal)) + 1e-12 * np.eye(len(normal))
@@ -137,8 +138,7 @@ def compare(surface: SdfGrid, before: tuple[Pose, LieRays], after: tuple[Pose, L
     for motion, lie in (before, after):
         pairs = zip(samples, lie.scenes, strict=True)
         off = np.concatenate([sample.residuals(surface, motion, SHARPNESS[-1], scene) for sample, scene in pairs])
-        square = (off / WIDTH) ** 2
-        errors.append(square / (1 + square))
+        errors.append(1 - cauchy((off / WIDTH) ** 2))
     groups = np.concatenate([sample.groups(k) for k, sample in enumerate(samples)])
     of_photo = np.unique(groups, return_inverse=True)[1]
     _, noise = mean_difference(errors[1], errors[0], of_photo)

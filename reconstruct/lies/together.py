@@ -18,6 +18,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from calibration.pose import Pose
+from capture.checks.robust import geman_mcclure
 from capture.errors import ReconstructionError
 from reconstruct.fields import SolvedScene
 from reconstruct.labels.held_out import hold_out
@@ -57,7 +58,7 @@ def merged_surface(lies: Sequence[tuple[SeenSurface, Pose]]) -> SdfGrid:
     for lie, motion in lies:
         phi = values_on(lie.grid, motion, origin, first.spacing, shape).reshape(-1).astype(float)
         away = KDTree(motion.apply(lie.points)).query(nodes)[0] / (NEAR * first.spacing)
-        weight = LEAST + 1 / (1 + away**2) ** 2
+        weight = LEAST + geman_mcclure(away**2)
         total, weights = total + weight * phi, weights + weight
         floor = np.maximum(floor, lie.ground_height - motion.inverse().apply(nodes)[:, 2])
     values = np.maximum(total / weights, floor).reshape(shape)

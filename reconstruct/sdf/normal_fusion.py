@@ -18,6 +18,7 @@ from scipy.sparse import csr_matrix, diags, vstack
 from scipy.sparse.linalg import cg
 from torch import Tensor
 
+from capture.checks.robust import geman_mcclure
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import as_distance
 from reconstruct.sdf.rays import first_hits
@@ -100,7 +101,7 @@ def _moved(surface: SdfGrid, seen: _Seen) -> SdfGrid:
     for _ in range(ROUNDS):
         left = np.stack([want - slope @ move for want, slope in zip(wanted, slopes, strict=True)], 1)
         across = left - (left * seen.normals).sum(1, keepdims=True) * seen.normals
-        weight = seen.trust / (1 + (across**2).sum(1) / OUTLIER**2) ** 2
+        weight = seen.trust * geman_mcclure((across**2).sum(1) / OUTLIER**2)
         matrix = prior + sum((slope.T @ diags(weight) @ slope for slope in slopes), csr_matrix(prior.shape))
         right = sum(slope.T @ (weight * want) for slope, want in zip(slopes, wanted, strict=True))
         scale = diags(1 / np.maximum(matrix.diagonal(), 1e-9))
