@@ -5,12 +5,14 @@ The numba kernels cannot carry such wrappers.
 
 import fcntl
 import gc
+import importlib
 import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 
 import checked_signatures
 import jaxtyping
@@ -165,6 +167,16 @@ def browser():
         chromium.close()
 
 
+@pytest.fixture
+def program(tmp_path) -> tuple[str, str]:
+    """What stands for `shadowgraph` in a studio: each run takes 0.3 s."""
+    from test_queue import PROGRAM
+
+    file = tmp_path / "program.py"
+    file.write_text(PROGRAM.replace("seconds = sys.argv[7]", 'seconds = "0.3"'))
+    return sys.executable, str(file)
+
+
 @pytest.fixture(scope="module")
 def server():
     """A bare viser server, for panels without their page."""
@@ -206,6 +218,27 @@ def finished_run(request) -> Callable[..., Path]:
         return Path(shutil.copytree(made, folder / "heap", ignore=left_out))
 
     return copy
+
+
+@pytest.fixture(scope="module")
+def run(finished_run, tmp_path_factory) -> Path:
+    """A finished run of this module's own, without its packed stage."""
+    return finished_run(tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture(scope="module")
+def studio_folder(finished_run, tmp_path_factory) -> Path:
+    """A studio's folder with a finished run and its packed stage, of this module's own."""
+    folder = tmp_path_factory.mktemp("studio")
+    finished_run(folder / "runs", has_stage=True)
+    return folder
+
+
+@pytest.fixture
+def bench(monkeypatch) -> Callable[[str], ModuleType]:
+    """The modules of benchmarks/ by name, as a command there imports them."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    return importlib.import_module
 
 
 @pytest.fixture

@@ -141,3 +141,13 @@ def write_shadowneus(folder: Path, truth: Truth, light_type: str | None = "point
     (folder / "transforms_train.json").write_text(json.dumps(scene))
     (folder / "transforms_floor.json").write_text(json.dumps({"frames": [{"transform_ground": np.eye(4).tolist()}]}))
     return folder
+
+
+def write_deepshadow(folder: Path, truth: Truth, height: float = 400.0) -> None:
+    """Grey pictures of where the light arrives, seen from this height."""
+    for i, grey in enumerate(truth.visibility):
+        write_grey(folder / "0" / f"cup_0_{i}_shadow1.png", grey)
+    lines = [f"cup_0_{i} {x} {y} {z}" for i, (x, y, z) in enumerate(places(truth))]
+    (folder / "all_object_lights.txt").write_text("\n".join(lines) + "\n")
+    given = {"focal_length": 44.0, "cam_location_x": 0.0, "cam_location_y": 0.0, "cam_location_z": height}
+    (folder / "params.json").write_text(json.dumps(given))

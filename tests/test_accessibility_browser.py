@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 
 import pytest
-from chromium import CHROMIUM, PATIENCE_MS, wait_until
+from chromium import PATIENCE_MS, wait_until
 from studio_client import served
 from test_studio import capture_in, run_in
 
@@ -17,7 +17,6 @@ AXE = Path(os.environ.get("AXE_CORE") or ROOT / "node_modules" / "axe-core" / "a
 pytestmark = [
     pytest.mark.browser,
     pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
     pytest.mark.skipif(not AXE.is_file(), reason="axe-core is not here: npm install --no-save axe-core"),
 ]
 RUN = """async () => {
@@ -31,12 +30,10 @@ SIZES = [{"width": 1600, "height": 1000}, {"width": 390, "height": 844}]
 
 
 @pytest.fixture(scope="module")
-def folder(finished_run, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("studio")
-    finished_run(folder / "runs", has_stage=True)
-    capture_in(folder, "vase")
-    run_in(folder, "vase", is_finished=False, message="a level")
-    return folder
+def folder(studio_folder):
+    capture_in(studio_folder, "vase")
+    run_in(studio_folder, "vase", is_finished=False, message="a level")
+    return studio_folder
 
 
 def judged(frame) -> list[str]:

@@ -1,6 +1,5 @@
 """The bed: what is drawn, how runs are judged, and what is told of captures that nobody may look into."""
 
-import importlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -8,15 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-FOLDER = Path(__file__).parent.parent / "benchmarks"
 SEEDS = (1, 77, 1003)
-
-
-@pytest.fixture
-def bench(monkeypatch):
-    """The modules of benchmarks/ by name, as a command there imports them."""
-    monkeypatch.syspath_prepend(str(FOLDER))
-    return importlib.import_module
 
 
 def row(seed: int, outcome: str = "success", cpu_s: float = 40.0, kind: str = "close", **more) -> dict:

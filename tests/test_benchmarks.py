@@ -1,6 +1,5 @@
 """The benchmarks: each answers --help, rows say how they were made, and are collected on one page."""
 
-import importlib
 import json
 import re
 import runpy
@@ -10,24 +9,12 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import torch
 
 from reconstruct.run.presets import preset
 
 FOLDER = Path(__file__).parent.parent / "benchmarks"
 NAMES = ("run_*.py", "bed.py", "read_files.py", "collect.py")
 COMMANDS = sorted(path.name for name in NAMES for path in FOLDER.glob(name))
-
-
-@pytest.fixture
-def bench(monkeypatch):
-    """The modules of benchmarks/ by name, as a command there imports them."""
-    monkeypatch.syspath_prepend(str(FOLDER))
-
-    def load(name: str):
-        return importlib.import_module(name)
-
-    return load
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -60,17 +47,6 @@ def test_a_refused_solve_is_a_row_that_says_so(bench):
     none = replace(ball.calibration, lights=tuple(replace(x, used=False) for x in ball.calibration.lights))
     found = solves.outcome(ball, none, *preset("draft", 0))
     assert list(found) == ["refused"] and "light" in found["refused"]
-
-
-def test_the_torch_backend_is_compared_with_the_kernels_on_the_same_rays(bench, monkeypatch):
-    gpu, solves = bench("run_gpu"), bench("solves")
-    monkeypatch.setattr(gpu, "TIMED", 1)
-    look = replace(solves.LOOK, width=48, height=36, n_lights=4)
-    subject = solves.synthetic("shadow", look=look)
-    scene = solves.scene_of(subject, subject.calibration, look.width)
-    row = gpu.compare_level(scene, torch.device("cpu"), preset("draft", 0)[1], 24)
-    assert row["nodes"] == 24
-    assert row["gradient, relative difference"] < 1e-2 and row["step, relative difference"] < 1e-3
 
 
 def test_the_page_of_results_is_what_the_rows_make_and_has_at_most_twelve_tables(bench):

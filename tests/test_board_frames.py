@@ -53,9 +53,10 @@ def assert_right_ground(corners, pose) -> None:
     assert np.linalg.norm(fit.world_from_camera.translation - pose.translation) < 0.005 * pose.translation[2]
 
 
-@pytest.mark.parametrize("is_legacy", [False, True])
-@pytest.mark.parametrize("is_turned", [False, True], ids=["as named", "columns and rows exchanged"])
-@pytest.mark.parametrize("spec", SPECS)
+@pytest.mark.parametrize(  # as named, or with columns and rows exchanged
+    ("spec", "is_turned", "is_legacy"),
+    [(SPECS[0], False, False), (SPECS[1], True, False), (SPECS[1], False, True), (SPECS[2], True, True)],
+)
 def test_a_frame_of_markers_gives_the_pose(spec, is_turned, is_legacy):
     board = parse_board(spec)
     pose = pose_above(board, seed=1)
@@ -94,8 +95,10 @@ def test_a_frame_that_was_stored_mirrored_is_refused_as_such(tmp_path):
 # --- corners that are none
 
 
-@pytest.mark.parametrize("spec", [SPECS[2], "charuco:11x12:20:15:DICT_5X5_100", "checkerboard:13x9:20"])
-@pytest.mark.parametrize("bend", [0.0, -0.25])
+@pytest.mark.parametrize(
+    ("spec", "bend"),
+    [(SPECS[2], 0.0), ("charuco:11x12:20:15:DICT_5X5_100", -0.25), ("checkerboard:13x9:20", -0.25)],
+)
 def test_stray_corners_bend_nothing_and_are_left_out(spec, bend):
     """Two sides of the board are seen; what lies inside them shows two corners of something else."""
     board = parse_board(spec)

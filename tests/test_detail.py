@@ -144,24 +144,9 @@ def test_a_damaged_detail_is_refused_by_name(ball, detail, tmp_path):
 # --- the stage -------------------------------------------------------------------------------------------------------
 
 
-def test_the_stage_leaves_a_detail_and_is_done_once(ball, tmp_path):
-    known = KnownScene(ball.calibration, ball.paths, None, None)
-    source, options = Source(tmp_path, known=known), RunOptions(detail="on")
-    with RunFolder(tmp_path / "run") as run:
-        run.claim({}, {})
-        photos = read_photos(source, options)
-
-        def write() -> None:
-            write_detail(source, options, run, photos, CalibratedViews.of(ball.calibration), ball.fields)
-
-        assert done_once(run, "detail", "reading", write)
-        assert not done_once(run, "detail", "reading", write)
-        assert run.costs["detail"].cpu_seconds > 0
-        assert len(load_details(run.file(DETAIL), ball.fields)) == 1
-        assert "of memory and" in run.file("log.jsonl").read_text()
-
-
-def test_reduced_photos_that_the_run_keeps_are_not_decoded_again(ball, tmp_path, monkeypatch):
+def test_the_stage_leaves_a_detail_once_and_decodes_no_reduced_photo_again_that_the_run_keeps(
+    ball, tmp_path, monkeypatch
+):
     known = KnownScene(ball.calibration, ball.paths, None, None)
     source, options = Source(tmp_path, known=known), RunOptions(detail="on", preset="fine")
     with RunFolder(tmp_path / "run") as run:
@@ -176,8 +161,15 @@ def test_reduced_photos_that_the_run_keeps_are_not_decoded_again(ball, tmp_path,
         monkeypatch.setattr(capture.photos.photo, "_read_reduced", None)
         again = read_photos(source, options, run.file(KEPT))
         monkeypatch.setattr(detail_photos, "read_photo", counted)
-        write_detail(source, options, run, again, CalibratedViews.of(ball.calibration), ball.fields)
-        assert whole == list(ball.paths) and run.file(DETAIL).exists()
+
+        def write() -> None:
+            write_detail(source, options, run, again, CalibratedViews.of(ball.calibration), ball.fields)
+
+        assert done_once(run, "detail", "reading", write)
+        assert not done_once(run, "detail", "reading", write)
+        assert whole == list(ball.paths) and len(load_details(run.file(DETAIL), ball.fields)) == 1
+        assert run.costs["detail"].cpu_seconds > 0
+        assert "of memory and" in run.file("log.jsonl").read_text()
 
 
 @pytest.mark.parametrize(

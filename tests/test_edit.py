@@ -24,11 +24,6 @@ SMALL = ExportOptions(texture=128, faces=4000)
 
 
 @pytest.fixture(scope="module")
-def run(finished_run, tmp_path_factory):
-    return finished_run(tmp_path_factory.mktemp("runs"))
-
-
-@pytest.fixture(scope="module")
 def ball(run) -> SolvedScene:
     """A ball around the origin, above a ground far below, in the fields of another run."""
     axis = np.arange(-32.0, 33.0, SPACING)

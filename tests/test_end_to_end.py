@@ -1,22 +1,16 @@
 """Folders become meshes by the command alone: a rendered scene against its truth, a kill in the middle, real photos."""
 
 import json
-import os
-import signal
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from brief_drafts import ENVIRONMENT, brief_command
 from dataset_folders import write_shadowneus
 from PIL import Image
 from synthetic import HEAP, Look, Truth, render
-from waiting import wait_until
 
 import shadowgraph
-from reconstruct.run_folder.folder import read_log
 
 RESULTS = [
     "calibration.json",
@@ -73,25 +67,6 @@ def check_continuing_is_free(scene: Path, out: Path) -> None:
     assert shadowgraph.main([*same, "--preset", "fine"]) == 2
     assert shadowgraph.main(["export", str(out), str(out / "mesh.stl")]) == 0
     assert len(trimesh.load_mesh(out / "mesh.stl").faces) == len(trimesh.load_mesh(out / "mesh.ply").faces)
-
-
-@pytest.mark.slow  # two runs; test_crash.py and test_faults.py stop solves at every step
-@pytest.mark.usefixtures("brief_draft")
-def test_a_run_that_was_killed_continues_with_the_same_command(scene, tmp_path):
-    out = tmp_path / "out"
-    words = ["run", str(scene), "--out", str(out), "--preset", "draft", "--viewer", "off"]
-    process = subprocess.Popen(brief_command(*words), env=os.environ | ENVIRONMENT, stdout=subprocess.DEVNULL)
-
-    def is_solving() -> bool:
-        assert process.poll() is None
-        return any(line["stage"] == "solve" and line["done"] for line in read_log(out / "log.jsonl"))
-
-    wait_until(is_solving)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert (out / "lock").exists() and not (out / "mesh.ply").exists()
-    assert shadowgraph.main(words) == 0
-    assert (out / "mesh.ply").exists() and not (out / "lock").exists()
 
 
 def test_photos_of_a_phone_become_a_mesh_in_millimetres(phone_run):

@@ -7,20 +7,30 @@ import pytest
 import torch
 import trimesh
 from synthetic import BALL, Look, render
-from test_solver import SMALL, Listener
+from test_solver import assert_ball, of_shadows
 
 from reconstruct.fields import load_fields, save_fields
 from reconstruct.mesh.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence, volume_sigma
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
 from reconstruct.run.report_json import guessed, undersides
 from reconstruct.scene import light_share
-from reconstruct.solve.solver import fit
+from reconstruct.solve import solver
 
 
 @pytest.fixture(scope="module")
-def solved():
-    scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=16))
-    return fit(replace(scene, rgb=None), SMALL, Listener()), truth
+def by_shadows():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(solver, "hull_is_better", lambda *_: True)  # as hull_start, for all tests of this file
+        return of_shadows("point")
+
+
+@pytest.fixture(scope="module")
+def solved(by_shadows):
+    return by_shadows[0], by_shadows[2]
+
+
+def test_shadows_alone_give_the_ball_and_every_iteration_tells_its_error(by_shadows):
+    assert_ball(*by_shadows)
 
 
 def test_seen_vertices_face_the_camera_and_the_foot_behind_is_held_by_nothing(solved):

@@ -30,11 +30,6 @@ SMALL = ExportOptions(faces=800, texture=128, width=160, frames=3, lamp_size=0.0
 
 
 @pytest.fixture(scope="module")
-def run(finished_run, tmp_path_factory):
-    return finished_run(tmp_path_factory.mktemp("runs"))
-
-
-@pytest.fixture(scope="module")
 def full(run):
     return trimesh.load_mesh(run / "mesh.ply", process=False)
 

@@ -174,7 +174,7 @@ def test_the_glb_says_how_rough_the_object_is(fields, tmp_path):
     assert mesh_material(replace(fields, gloss=None), mesh) is None
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_no_lobe_is_made_up_that_no_photo_shows(seed):
     """Half vectors all stay some 13 degrees off the normal: of sharper lobes than the true ones there is only noise."""
     generator = torch.Generator().manual_seed(seed)

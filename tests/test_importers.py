@@ -288,14 +288,20 @@ def test_a_list_that_is_named_for_the_lights_makes_no_other_layout_either(tmp_pa
     assert find_importer(tmp_path, tmp_path / "lights.json") is not None
 
 
-@pytest.mark.parametrize("name", ["lights.csv", "lights.json", "stone.lp"])
-@pytest.mark.parametrize("is_named", [False, True])
+def bare_photos(folder):
+    """Six photos in a folder of their own, and what they show."""
+    truth = seen_from_above(side=32, n_lights=6)
+    write_rti(folder / "theirs", truth)
+    return truth, (folder / "theirs" / "jpeg-exports").rename(folder / "capture")
+
+
+@pytest.mark.parametrize(
+    ("name", "is_named"), [("lights.csv", False), ("lights.json", True), ("stone.lp", False), ("stone.lp", True)]
+)
 def test_a_list_with_the_light_of_every_photo_needs_no_board(tmp_path, name, is_named):
     """Whatever its kind, wherever it lies: the same lights, in the picture's frame."""
-    truth = seen_from_above(side=32, n_lights=6)
-    write_rti(tmp_path / "theirs", truth)
-    capture, elsewhere = tmp_path / "capture", tmp_path / "elsewhere"
-    (tmp_path / "theirs" / "jpeg-exports").rename(capture)
+    truth, capture = bare_photos(tmp_path)
+    elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (capture / "session.toml").write_text("")
     file = (elsewhere if is_named else capture) / name
@@ -337,9 +343,7 @@ def no_lights(path):
 )
 def test_a_file_that_the_user_names_is_the_one_that_is_refused(tmp_path, name, content):
     """Not its photos, in which then a board is looked for."""
-    write_rti(tmp_path / "theirs", seen_from_above(side=32, n_lights=6))
-    capture, file = tmp_path / "capture", tmp_path / name
-    (tmp_path / "theirs" / "jpeg-exports").rename(capture)
+    (_, capture), file = bare_photos(tmp_path), tmp_path / name
     file.write_bytes(content) if isinstance(content, bytes) else content(file) if callable(
         content
     ) else file.write_text(content)
@@ -369,10 +373,7 @@ def test_photos_in_room_light_beside_listed_ones_need_no_board(tmp_path, name):
 
 
 def test_places_in_pixels_are_lights_of_photos_without_a_board(tmp_path):
-    truth = seen_from_above(side=32, n_lights=6)
-    write_rti(tmp_path / "theirs", truth)
-    capture = tmp_path / "capture"
-    (tmp_path / "theirs" / "jpeg-exports").rename(capture)
+    truth, capture = bare_photos(tmp_path)
     expected = towards_lights(truth) * np.linspace(90, 200, 6)[:, None]
     scipy.io.savemat(tmp_path / "light.mat", {"S": expected})
     known = open_source(capture, RunOptions(lights=str(tmp_path / "light.mat"))).known
@@ -381,10 +382,7 @@ def test_places_in_pixels_are_lights_of_photos_without_a_board(tmp_path):
 
 
 def test_a_calibration_of_another_run_brings_camera_and_ground_to_photos_without_a_board(tmp_path):
-    truth = seen_from_above(side=32, n_lights=6)
-    write_rti(tmp_path / "theirs", truth)
-    capture = tmp_path / "capture"
-    (tmp_path / "theirs" / "jpeg-exports").rename(capture)
+    truth, capture = bare_photos(tmp_path)
     names = [f"stone_{i + 1:02d}.png" for i in range(6)]
     lights = [replace(light, photo=name) for light, name in zip(truth.calibration.lights, names, strict=True)]
     save_calibration(replace(truth.calibration, lights=tuple(lights)), tmp_path / "calibration.json")
@@ -407,8 +405,8 @@ def test_the_focal_length_of_exif_is_the_cameras_unless_the_picture_was_cropped(
     assert cropped.camera.fx == 1000 and "assumed" in said
 
 
-@pytest.mark.parametrize("name", ["suns", "lamps_of_a_dome", "a_scanner"])
-def test_a_layout_of_another_program_is_one_module(name, tmp_path, monkeypatch):
+def test_a_layout_of_another_program_is_one_module(tmp_path, monkeypatch):
+    name = "lamps_of_a_dome"
     (tmp_path / "modules").mkdir()
     (tmp_path / "modules" / f"layout_of_{name}.py").write_text(
         f"class Layout:\n    layout = 'a layout of {name}'\n    def recognises(self, folder):\n"

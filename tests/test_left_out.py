@@ -65,8 +65,7 @@ def left_out(folder: Path) -> dict[str, tuple[str, str]]:
     return {one.photo.name: (one.kind, one.role) for one in load_session(folder).left_out}
 
 
-@pytest.mark.parametrize("how", BREAKS)
-@pytest.mark.parametrize("is_sorted", [True, False])
+@pytest.mark.parametrize(("how", "is_sorted"), [*((how, True) for how in BREAKS), ("truncated", False)])
 def test_a_photo_that_cannot_be_read_is_left_out_by_name(tmp_path, how, is_sorted):
     folder = save_capture(tmp_path, is_sorted)
     BREAKS[how](folder / ("photos" if is_sorted else "") / LIT[2])
@@ -123,8 +122,7 @@ SIZES = {
 }
 
 
-@pytest.mark.parametrize("how", SIZES)
-@pytest.mark.parametrize("role", ["photos", "dark"])
+@pytest.mark.parametrize(("how", "role"), [*((how, "photos") for how in SIZES), ("a crop", "dark")])
 def test_a_photo_of_another_size_is_left_out(tmp_path, how, role):
     folder = save_capture(tmp_path)
     rng = np.random.default_rng(5)
@@ -153,9 +151,9 @@ def test_where_too_few_are_left_one_error_lists_all_faults(tmp_path, is_sorted):
 CLOSE = np.array([[-60, -50], [340, -30], [330, 290], [-40, 270]])
 
 
-@pytest.mark.parametrize("second", [5, 13])  # before and between the lit photos
-@pytest.mark.parametrize("model", ["Tripod", "Another"])
-@pytest.mark.parametrize("light", [1.0, 3.0])  # angle of the flashlight: a close-up by it is dim at one side
+@pytest.mark.parametrize(  # before and between the lit photos; angle of the flashlight: a close-up is dim at one side
+    ("second", "model", "light"), [(5, "Tripod", 1.0), (13, "Another", 1.0), (13, "Tripod", 3.0)]
+)
 def test_a_photo_in_which_a_board_is_found_is_one_of_the_board(tmp_path, second, model, light):
     folder, rng = save_capture(tmp_path, is_sorted=False), np.random.default_rng(2)
     close = lit_table.with_board(lit_table.table(rng), CLOSE) * lit_table.flashlight(light, in_shadow=1.0)
@@ -170,8 +168,7 @@ def test_a_photo_in_which_a_board_is_found_is_one_of_the_board(tmp_path, second,
 BOARDS = ["charuco:5x7:30:22:DICT_4X4_50", "checkerboard:6x9:24", "charuco:6x8:25:18:DICT_5X5_100"]
 
 
-@pytest.mark.parametrize("spec", BOARDS)
-@pytest.mark.parametrize("is_named", [True, False])
+@pytest.mark.parametrize(("spec", "is_named"), [*((spec, False) for spec in BOARDS), (BOARDS[1], True)])
 def test_a_board_is_found_in_a_close_up_and_not_on_a_bare_table(tmp_path, spec, is_named):
     board, camera = parse_board(spec), Camera(960, 720, 900.0, 900.0, 479.5, 359.5)
     close = board_photos.look_at((80.0, -230.0, 260.0), (70.0, -90.0, 0.0), roll=0.3)

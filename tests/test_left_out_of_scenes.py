@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from dataset_folders import (
     from_above,
-    places,
     towards_lights,
+    write_deepshadow,
     write_diligent,
-    write_grey,
     write_photo,
     write_rti,
     write_s3nerf,
@@ -72,9 +71,10 @@ def photos_of(place):
     return sorted(p for p in place.glob("*.png") if p.stem not in others and not p.stem.endswith("_white_"))
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("layout", [rti, diligent, by_order])
-@pytest.mark.parametrize("index", [0, 3])
+@pytest.mark.parametrize(
+    ("layout", "fault", "index"),
+    [(rti, "truncated", 0), (diligent, "size", 3), (by_order, "empty", 3), (by_order, "size", 0)],
+)
 def test_a_bad_photo_is_left_out_with_its_light(tmp_path, truth, layout, fault, index):
     place = layout(tmp_path / "scene", truth)
     spoil, kind = FAULTS[fault]
@@ -124,21 +124,13 @@ def shadowneus(folder, _):
     return folder / "train"
 
 
-def deepshadow(folder, truth):
-    lines = []
-    for i, (x, y, z) in enumerate(places(truth)):
-        write_grey(folder / "0" / f"cup_0_{i}_shadow1.png", truth.visibility[i])
-        lines.append(f"cup_0_{i} {x} {y} {z}")
-    given = {"focal_length": 44.0} | {f"cam_location_{axis}": 0.0 if axis != "z" else 40.0 for axis in "xyz"}
-    (folder / "params.json").write_text(json.dumps(given))
-    (folder / "all_object_lights.txt").write_text("\n".join(lines))
-    return folder / "0"
-
-
-@pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize(
-    ("layout", "pictures"),
-    [(s3nerf, "visibility/*.png"), (shadowneus, "train/*_white_.png"), (deepshadow, "0/*_shadow1.png")],
+    ("layout", "pictures", "fault"),
+    [
+        (s3nerf, "visibility/*.png", "size"),
+        (shadowneus, "train/*_white_.png", "truncated"),
+        (write_deepshadow, "0/*_shadow1.png", "empty"),
+    ],
 )
 def test_a_bad_picture_of_shadows_is_left_out_with_its_photo_and_light(tmp_path, layout, pictures, fault):
     point_lights = Look(width=SIDE, height=SIDE, n_lights=PHOTOS)
@@ -157,8 +149,7 @@ def test_a_bad_picture_of_shadows_is_left_out_with_its_photo_and_light(tmp_path,
     assert read is not None and len(read) == PHOTOS - 1
 
 
-@pytest.mark.parametrize("is_named", [False, True], ids=["beside the photos", "by --lights"])
-@pytest.mark.parametrize("name", ["lights.csv", "lights.lp", "lights.mat"])
+@pytest.mark.parametrize(("name", "is_named"), [("lights.csv", False), ("lights.lp", True), ("lights.mat", True)])
 def test_a_list_with_fewer_rows_than_photos_says_both_counts_and_the_remedy(tmp_path, truth, name, is_named):
     scene = by_order(tmp_path / "scene", truth)
     (scene / "lights.csv").unlink()

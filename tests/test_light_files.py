@@ -42,6 +42,13 @@ def assert_towards_the_lights(given):
     np.testing.assert_allclose(np.array([light.direction for light in given.lights]), expected, atol=2e-4)
 
 
+def assert_lights(given, kind):
+    if kind == "directional":
+        assert_towards_the_lights(given)
+    else:
+        np.testing.assert_allclose(places(given), PLACES, atol=1e-6)
+
+
 def their_camera(flip: bool) -> np.ndarray:
     """Our camera in the other world, lengths in its unit; flip: looking along its -z."""
     pose = ELSEWHERE @ Pose(WORLD_FROM_CAMERA.rotation, WORLD_FROM_CAMERA.translation * UNIT)
@@ -102,10 +109,7 @@ def test_shadowneus_scenes_are_placed_by_their_camera(tmp_path, kind):
     file = tmp_path / "transforms_train.json"
     file.write_text(json.dumps({"light_type": kind, "frames": frames}))
     given = read_lights(file, PHOTOS, POSED_CAMERA)
-    if kind == "directional":
-        assert_towards_the_lights(given)
-    else:
-        np.testing.assert_allclose(places(given), PLACES, atol=1e-6)
+    assert_lights(given, kind)
 
 
 def test_our_own_calibration_comes_back_with_beam_and_power(tmp_path):
@@ -263,14 +267,10 @@ def test_a_table_of_places_is_read_as_places(tmp_path, head, scale, kind):
         (lambda: {"anything": np.round(unit_directions(), 4).astype(np.float32)}, "directional"),
     ],
 )
-@pytest.mark.parametrize("how", [{"do_compression": True}, {"do_compression": False}, {"format": "4"}])
-def test_arrays_of_matlab_are_read_by_their_usual_names(tmp_path, content, kind, how):
-    scipy.io.savemat(tmp_path / "light.mat", content(), **how)
-    given = read_lights(tmp_path / "light.mat", PHOTOS, POSED_CAMERA)
-    if kind == "directional":
-        assert_towards_the_lights(given)
-    else:
-        np.testing.assert_allclose(places(given), PLACES, atol=1e-6)
+def test_arrays_of_matlab_are_read_by_their_usual_names(tmp_path, content, kind):
+    for how in ({"do_compression": True}, {"do_compression": False}, {"format": "4"}):
+        scipy.io.savemat(tmp_path / "light.mat", content(), **how)
+        assert_lights(read_lights(tmp_path / "light.mat", PHOTOS, POSED_CAMERA), kind)
 
 
 def test_an_array_of_numpy_is_read(tmp_path):

@@ -1,13 +1,10 @@
 """A list of lights that is turned or mirrored against its photos: the way that fits is said by check and run."""
 
-import json
-
 import numpy as np
 import pytest
 from dataset_folders import write_photo
 from PIL import Image
 
-import shadowgraph
 from calibration.scenes.importers import find_importer
 from calibration.scenes.list_axes import UPRIGHT, WAYS
 from capture.photos.photo import encode_srgb
@@ -88,8 +85,7 @@ def listed_so_that(way):
     return found
 
 
-@pytest.mark.parametrize("height", [egg, waves, saddle])
-@pytest.mark.parametrize("way", range(8))
+@pytest.mark.parametrize(("height", "way"), [*((egg, way) for way in range(8)), (waves, 0), (waves, 2), (saddle, 5)])
 def test_the_way_that_a_list_fits_is_said_with_the_figures(tmp_path, height, way):
     said = warnings_of(write(tmp_path, height, listed_so_that(way)))
     if way == 0 or (way == 2 and height is not egg):  # of a relief, hills and dales look the same
@@ -118,15 +114,7 @@ def test_a_list_over_the_stored_pictures_fits_whatever_their_orientation(tmp_pat
     assert warnings_of(write(tmp_path, egg, right, orientation)) == []
 
 
-@pytest.mark.parametrize("height", [egg, waves, saddle])
+@pytest.mark.parametrize("height", [egg, waves])
 def test_lines_in_another_order_fit_in_no_way(tmp_path, height):
     (sentence,) = warnings_of(write(tmp_path, height, lights()[np.random.default_rng(5).permutation(PHOTOS)]))
     assert "contradicts the listed lights" in sentence and "order" in sentence
-
-
-def test_check_says_it_too(tmp_path):
-    way = 4
-    write(tmp_path / "stone", waves, listed_so_that(way))
-    assert shadowgraph.main(["check", str(tmp_path / "stone"), "--out", str(tmp_path / "out")]) == 0
-    said = json.loads((tmp_path / "out" / "check.json").read_text())
-    assert said["verdict"] != "good" and any(f"'{ROWS[way]}'" in reason for reason in said["reasons"])

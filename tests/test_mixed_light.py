@@ -85,12 +85,11 @@ def with_another(lights, both):
     return replace(stack, rgb=stack.rgb + other.rgb * both[:, None, None, None])
 
 
-@pytest.mark.parametrize("where", ARRANGEMENTS)
 def test_photos_under_two_flashlights_are_told_and_left_out_before_outlines_are_looked_for(
-    lights, calibrated, monkeypatch, where
+    lights, calibrated, monkeypatch
 ):
     """Outlines cost most, and hide the second light: with them the powers are held alike."""
-    both, asked = np.isin(np.arange(N), ARRANGEMENTS[where]), []
+    both, asked = np.isin(np.arange(N), ARRANGEMENTS["first half"]), []
     monkeypatch.setattr(light_estimate, "with_outlines", lambda *given: asked.append(given[3]))
     found = calibrated(with_another(lights, both))
     left_out = np.array(["a second light is on" in light.reason for light in found.lights])

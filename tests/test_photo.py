@@ -50,8 +50,9 @@ def save(path: Path, pixels: np.ndarray, **options) -> Path:
     return path
 
 
-@pytest.mark.parametrize("suffix", list(FORMATS))
-@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize(
+    ("suffix", "orientation"), [*((".jpg", tag) for tag in range(1, 9)), *((suffix, 6) for suffix in FORMATS)]
+)
 def test_a_photo_is_read_in_the_sensors_frame_whatever_its_orientation_says(tmp_path, suffix, orientation):
     pixels = decode(save(tmp_path / f"photo{suffix}", picture(), exif=exif(orientation))).pixels
     assert pixels.shape == (48, 64, 3)
@@ -67,8 +68,9 @@ def stating(path: Path, transfer: int) -> Path:
     return path
 
 
-@pytest.mark.parametrize("suffix", [".heic", ".avif"])
-@pytest.mark.parametrize("transfer", [1, 2, *range(4, 19)])  # libheif refuses those that H.273 reserves
+@pytest.mark.parametrize(  # libheif refuses those that H.273 reserves
+    ("transfer", "suffix"), [*((k, ".heic") for k in (1, 2, *range(4, 19))), *((k, ".avif") for k in (1, 4, 16))]
+)
 def test_a_heic_or_avif_photo_is_read_by_the_curve_that_its_container_states(tmp_path, suffix, transfer):
     path = stating(tmp_path / f"photo{suffix}", transfer)
     curve = {16: "PQ", 18: "HLG"}.get(transfer, str(transfer))

@@ -1,4 +1,3 @@
-import numpy as np
 import pytest
 import trimesh
 
@@ -9,15 +8,6 @@ def a_mesh() -> trimesh.Trimesh:
     mesh = trimesh.creation.icosphere(subdivisions=2, radius=30.0)
     _ = mesh.vertex_normals  # the solver's mesh has them, and they are written, too
     return mesh
-
-
-def test_what_trimesh_writes_is_read_back(tmp_path):
-    mesh = a_mesh()
-    mesh.export(tmp_path / "preview.ply")
-    found = read_preview(tmp_path / "preview.ply")
-    assert found is not None
-    np.testing.assert_array_equal(found.faces, mesh.faces)
-    np.testing.assert_allclose(found.vertices, mesh.vertices, atol=1e-5)
 
 
 @pytest.mark.parametrize("kept", [0, 3, 40, 200, 2000, -1])

@@ -5,11 +5,10 @@ import sys
 import zipfile
 
 import pytest
-from chromium import CHROMIUM
 from studio_client import served
 from test_intake import jpeg
 from test_studio import capture_in
-from test_studio_browser import DESKTOP, PHONE, browser, opened  # noqa: F401  a fixture
+from test_studio_browser import PHONE, opened
 from waiting import wait_until
 
 from capture.errors import CaptureError
@@ -34,21 +33,21 @@ REFUSED = {  # name, content, role
 }
 
 
-@pytest.mark.parametrize("kind", REFUSED)
-def test_a_refused_file_is_said_without_the_servers_path_or_a_folder_that_the_sender_does_not_have(tmp_path, kind):
-    name, content, role = REFUSED[kind]
-    capture_in(tmp_path, "vase")
-    capture = tmp_path / "vase"
-    if role:
-        (capture / "photos").rename(capture / "loose")
-        (capture / "loose" / "IMG_0.jpg").rename(capture / "IMG_0.jpg")
-        (capture / "session.toml").write_text("board = ")
+def test_a_refused_file_is_said_without_the_servers_path_or_a_folder_that_the_sender_does_not_have(tmp_path):
+    for number in range(len(REFUSED)):
+        capture_in(tmp_path, f"vase{number}")
     with served(tmp_path) as (_, _, owner):
-        owner.send("vase", name, content, role)
-        refused = owner.get("/api/capture?key=vase")[1]["refused"]
-    assert refused
-    for one in refused:
-        assert str(tmp_path) not in one["why"] and "from the folder" not in one["why"], one["why"]
+        for number, (name, content, role) in enumerate(REFUSED.values()):
+            capture = tmp_path / f"vase{number}"
+            if role:
+                (capture / "photos").rename(capture / "loose")
+                (capture / "loose" / "IMG_0.jpg").rename(capture / "IMG_0.jpg")
+                (capture / "session.toml").write_text("board = ")
+            owner.send(capture.name, name, content, role)
+            refused = owner.get(f"/api/capture?key={capture.name}")[1]["refused"]
+            assert refused
+            for one in refused:
+                assert str(tmp_path) not in one["why"] and "from the folder" not in one["why"], one["why"]
 
 
 @pytest.mark.parametrize(
@@ -72,9 +71,8 @@ def test_a_run_that_failed_says_why_without_the_servers_path(tmp_path, said):
 
 
 @pytest.mark.browser
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 @pytest.mark.parametrize("count", [1, 4, 6])
-def test_photos_that_will_not_be_used_are_named_and_counted(browser, tmp_path, count):  # noqa: F811
+def test_photos_that_will_not_be_used_are_named_and_counted(browser, tmp_path, count):
     capture = capture_in(tmp_path, "vase")
     for number in range(10, 10 + count):
         (capture / "photos" / f"IMG_{number}.jpg").write_bytes(jpeg(number)[:-200])
@@ -95,8 +93,7 @@ def test_a_file_without_bytes_or_with_too_many_is_refused_in_words_that_fit(tmp_
 
 
 @pytest.mark.browser
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-def test_each_refused_file_is_named_once_and_dismissed_without_an_offer_to_try_again(browser, tmp_path):  # noqa: F811
+def test_each_refused_file_is_named_once_and_dismissed_without_an_offer_to_try_again(browser, tmp_path):
     photos = tmp_path / "drop"
     photos.mkdir()
     for name, content in {"notes.txt": b"x", "IMG_1.jpg": b"no photo", "list.md": b"y", "IMG_2.jpg": jpeg(2)}.items():
@@ -124,8 +121,7 @@ def test_each_refused_file_is_named_once_and_dismissed_without_an_offer_to_try_a
 
 
 @pytest.mark.browser
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-def test_a_used_code_says_to_scan_the_new_one_and_so_does_a_page_that_was_loaded_anew(browser, tmp_path):  # noqa: F811
+def test_a_used_code_says_to_scan_the_new_one_and_so_does_a_page_that_was_loaded_anew(browser, tmp_path):
     capture_in(tmp_path, "vase")
     with served(tmp_path) as (_, phones, owner):
         owner.ok("let_in", key="vase")

@@ -15,11 +15,6 @@ from reconstruct.stored_run.stored_run import StoredRun
 WIDTH = 64
 
 
-@pytest.fixture(scope="module")
-def run(finished_run, tmp_path_factory):
-    return finished_run(tmp_path_factory.mktemp("runs"))
-
-
 def relit(run, tmp_path, *arguments, name="it.exr"):
     file = tmp_path / name
     assert shadowgraph.main(["relight", str(run), *arguments, "--out", str(file), "--width", str(WIDTH)]) == 0
@@ -97,9 +92,3 @@ def test_what_cannot_be_made_is_refused_in_one_sentence(run, tmp_path, monkeypat
     assert shadowgraph.main(["relight", str(run), *arguments]) == 2
     error = capsys.readouterr().err
     assert words in error and "Traceback" not in error
-
-
-def test_a_map_that_is_none_is_refused(run, tmp_path, capsys):
-    (tmp_path / "sky.hdr").write_bytes(b"no picture at all")
-    assert shadowgraph.main(["relight", str(run), "--env", str(tmp_path / "sky.hdr")]) == 2
-    assert "sky.hdr" in capsys.readouterr().err

@@ -13,12 +13,13 @@ from reconstruct.check.light_coverage import widest_gap
 from reconstruct.run_folder.folder import RunFolder
 from viewer.report.drawing import difference_picture, mesh_picture, normal_picture, reduced
 from viewer.report.figures import curves, lights_from_above
+from viewer.report.numbers import refinement_part
 from viewer.report.pictures import guess_facts, mesh_pictures
 from viewer.report.report import write_report
 
 
 @pytest.fixture(scope="module")
-def run_dir(truth, tmp_path_factory):
+def run(truth, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "heap"
     fake_run.start_run(folder, truth)
     fake_run.finish_run(folder, truth)
@@ -57,9 +58,9 @@ def page_of(folder) -> str:
 
 
 @pytest.fixture(scope="module")
-def whole_page(run_dir) -> str:
+def whole_page(run) -> str:
     """The report of a whole run."""
-    return page_of(run_dir)
+    return page_of(run)
 
 
 # --- the document ----------------------------------------------------------------------------------------------------
@@ -93,8 +94,8 @@ def test_the_report_asks_no_server_for_anything(whole_page):
     assert "default-src 'none'" in whole_page
 
 
-def test_names_and_reasons_from_files_are_text_and_not_page(run_dir, tmp_path):
-    report = json.loads((run_dir / "report.json").read_text())
+def test_names_and_reasons_from_files_are_text_and_not_page(run, tmp_path):
+    report = json.loads((run / "report.json").read_text())
     report["warnings"] = ["<script>alert(1)</script>"]
     report["photos"][0] |= {"name": '"><img src=x onerror=alert(1)>.jpg', "used": False, "reason": "<b>"}
     (tmp_path / "report.json").write_text(json.dumps(report))
@@ -124,22 +125,20 @@ def test_an_empty_folder_gets_a_report_too(tmp_path):
     assert "There is no mesh" in Reader(page_of(tmp_path)).text
 
 
-@pytest.mark.parametrize("name", ["calibration.json", "fields.safetensors", "normal.npy"])
-def test_a_damaged_file_is_named_and_the_rest_is_shown(tmp_path, truth, name):
-    fake_run.start_run(tmp_path, truth)
-    fake_run.finish_run(tmp_path, truth)
-    (tmp_path / name).write_bytes(b"{damaged")
-    text = Reader(page_of(tmp_path)).text
+@pytest.mark.parametrize("name", ["calibration.json", "normal.npy"])
+def test_a_damaged_file_is_named_and_the_rest_is_shown(finished_run, tmp_path, name):
+    run = finished_run(tmp_path)
+    (run / name).write_bytes(b"{damaged")
+    text = Reader(page_of(run)).text
     assert "could not be read" in text and "Triangles of the mesh" in text
     assert name in text or "depth.npy" in text
 
 
-def test_a_scene_in_its_own_unit_is_not_given_in_millimetres(tmp_path, truth):
-    fake_run.start_run(tmp_path, truth)
-    fake_run.finish_run(tmp_path, truth)
-    save_calibration(replace(fake_run.calibration_of(truth), unit="scene"), tmp_path / "calibration.json")
-    (tmp_path / "report.json").unlink()
-    assert " mm" not in Reader(page_of(tmp_path)).text.replace(" mm away", "")
+def test_a_scene_in_its_own_unit_is_not_given_in_millimetres(finished_run, tmp_path, truth):
+    run = finished_run(tmp_path)
+    save_calibration(replace(fake_run.calibration_of(truth), unit="scene"), run / "calibration.json")
+    (run / "report.json").unlink()
+    assert " mm" not in Reader(page_of(run)).text.replace(" mm away", "")
 
 
 # --- pictures --------------------------------------------------------------------------------------------------------
@@ -239,3 +238,21 @@ def test_each_picture_of_the_mesh_says_how_much_of_what_it_shows_is_known():
     assert 40 < right[1] < 90 and sum(right) < 100
     del ball.vertex_attributes["evidence"]
     assert "seen in the photos" not in mesh_pictures(ball, None)
+
+
+def test_the_report_tells_how_far_each_light_moved_and_why_it_was_kept(truth):
+    calibration = replace(truth.calibration, lights=truth.calibration.lights[:4])
+    rows = [
+        {
+            "photo": x.photo,
+            "position": x.homogeneous()[:3] + np.array([by, 0, 0]),
+            "moved": by,
+            "sigma": [5.0] * 3,
+            "sigmas": by,
+        }
+        for by, x in enumerate(calibration.lights, 1)
+    ]
+    trial = {"accepted": True, "sentence": "refined lights decided upon", "noise": 0.1}
+    page = refinement_part({"refined_lights": rows, "light_trial": trial}, calibration, None)
+    assert "Refined lights decided upon." in page and calibration.lights[3].photo in page
+    assert "<td" in page and "2.5" in page  # the median

@@ -53,6 +53,8 @@ def test_the_file_keeps_the_contract(tmp_path):
         (("units",), "inch", "units"),
         (("camera", "fx"), float("nan"), "camera.fx"),
         (("camera", "fx"), -3, "camera.fx"),
+        (("camera", "fx"), 1e300, "camera.fx"),
+        (("camera", "fx"), 1e12, "camera.fx"),
         (("camera", "width"), 640.5, "camera.width"),
         (("camera", "distortion"), [0, 0], "camera.distortion"),
         (("camera", "sigmas", "fx"), -1, r"camera.sigmas is .*in each entry"),
@@ -70,6 +72,12 @@ def test_the_file_keeps_the_contract(tmp_path):
         (("lights",), {}, "lights"),
         (("lobe",), ["m"], r"lobe\[0\]"),
         (("residuals", "reprojection_rms_px"), float("nan"), "residuals.reprojection_rms_px"),
+        (("residuals", "camera_height_sigma_mm"), "x", "camera_height_sigma_mm is 'x'"),
+        (("residuals", "notes"), [1], r"notes\[0\] is 1"),
+        (("lights", 1, "sigma"), [1, 2], r"sigma is \[1, 2\]; needed: a list of length 3"),
+        (("lights", 0, "photo"), "../../secret", r"lights\[0\]\.photo is .*the name of a file"),
+        (("lights", 0, "photo"), "", r"lights\[0\]\.photo is .*the name of a file"),
+        (("lights", 0, "photo"), "a\0b", r"lights\[0\]\.photo is .*the name of a file"),
     ],
 )
 def test_a_wrong_field_is_refused_by_name(tmp_path, path, value, named):

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from fake_run import finish_run, make_truth, start_run
+from fake_run import start_run
 
 import shadowgraph
 from capture.errors import ReconstructionError, UserError
@@ -12,12 +12,9 @@ from shadowgraph.run_result import RunResult
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("runs") / "two <balls>"
-    truth = make_truth()
-    start_run(path, truth)
-    finish_run(path, truth)
-    return path
+def folder(finished_run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    return finished_run(folder).rename(folder / "two <balls>")
 
 
 def test_a_result_gives_mesh_maps_calibration_and_report(folder):
@@ -26,22 +23,22 @@ def test_a_result_gives_mesh_maps_calibration_and_report(folder):
     assert result.mesh.is_watertight
     assert result.depth.shape == result.normals.shape[:2] == result.mask.shape
     assert np.isfinite(result.depth[result.mask]).all()
-    assert len(result.calibration.lights) == 12
+    assert len(result.calibration.lights) == 6
     assert result.warnings == ["The lights cover only half of the sky; the far side is a guess."]
     assert "faces" in repr(result)
-    assert repr(result.calibration) == "Calibration(160 x 120 px, 11 of 12 lights used, unit 'mm')"
+    assert repr(result.calibration) == "Calibration(96 x 72 px, 5 of 6 lights used, unit 'mm')"
     assert re.fullmatch(r"SolvedScene\(\d+ x \d+ x \d+ nodes of [\d.]+ mm, matt\)", repr(result.fields))
 
 
 def test_a_notebook_shows_a_card_in_which_names_are_only_text(folder):
     card = RunResult(folder)._repr_html_()
     assert "two &lt;balls&gt;" in card
-    assert "11 of 12 photos used" in card
+    assert "5 of 6 photos used" in card
     assert "data:image/png" in card
 
 
-def test_a_run_that_is_not_finished_says_what_is_missing(tmp_path):
-    start_run(tmp_path / "run", make_truth())
+def test_a_run_that_is_not_finished_says_what_is_missing(tmp_path, truth):
+    start_run(tmp_path / "run", truth)
     with pytest.raises(ReconstructionError, match=r"fields\.safetensors, mesh\.ply, report\.json"):
         RunResult(tmp_path / "run")
 

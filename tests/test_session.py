@@ -125,15 +125,6 @@ def test_a_wrong_entry_in_session_toml_is_named(tmp_path, text, message):
         load_settings(tmp_path)
 
 
-def test_session_toml_cannot_name_files_outside_the_folder_or_the_truth(tmp_path):
-    folder, _, _ = save_capture(tmp_path / "capture", in_folders=True)
-    (tmp_path / "outside.jpg").write_bytes((folder / "photos" / LIT[0]).read_bytes())
-    for name in ("../outside.jpg", str(tmp_path / "outside.jpg"), "gt/x.jpg", "missing.jpg"):
-        (folder / "session.toml").write_text(f'[roles]\nlit = ["{name}"]\n')
-        with pytest.raises(CaptureError, match="which is not in"):
-            load_session(folder)
-
-
 @pytest.mark.parametrize(
     ("in_folders", "message"),
     [

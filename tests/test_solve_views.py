@@ -15,15 +15,11 @@ from capture.errors import ReconstructionError
 from reconstruct.config import FitConfig, Level
 from reconstruct.fields import SolvedScene, load_fields, save_fields
 from reconstruct.labels.labels import assemble_labels
-from reconstruct.labels.observer import Observer
-from reconstruct.labels.supervision import supervise
 from reconstruct.render.g_buffer import albedo_at, seen_material, surface_maps
 from reconstruct.render.joined import join_views
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.level_set import resampled
 from reconstruct.shading import joint_normals
-from reconstruct.solve.operators import JointPasses
 from reconstruct.solve.solver import fit
 
 SHAPES = (Sphere((0.0, 0.0, 30.0), 30.0, (0.7, 0.5, 0.3)), Sphere((12.0, 8.0, 60.0), 14.0, (0.3, 0.5, 0.7)))
@@ -167,25 +163,6 @@ def test_views_of_objects_at_different_places_are_refused(views):
     away = tuple(replace(s, centre=(s.centre[0] - 70, s.centre[1] + 40, s.centre[2])) for s in SHAPES)
     with pytest.raises(ReconstructionError, match=r"different places|contradict each other"):
         fit((views[0][0], seen_from(120.0, 6, 1, away)[0]), QUICK, lambda **_: None)
-
-
-def test_both_backends_add_up_the_same_gradient_of_several_views(views, solved):
-    scenes = views[0][:2]
-    labels = [Observer(scene).labels(solved.grid, scene) for scene in scenes]
-    sums = []
-    for device in (None, torch.device("cpu")):
-        start = resampled(SdfGrid(solved.grid.values - 1.0, solved.grid.origin, solved.grid.spacing), 24)
-        surface = start.on(device)
-        rays = tuple(supervise(scene, own) for scene, own in zip(scenes, labels, strict=True))
-        shoot = JointPasses(surface, scenes, rays, QUICK)
-        shoot.look(surface.grid(), scenes, 0, 8.0, 0.5)
-        losses = shoot(0, 8.0)
-        sums.append((surface.sums()[0], losses, shoot.light_gradient()))
-    (kernels, losses, lights), (ours, others, moved) = sums
-    assert losses == pytest.approx(others, rel=1e-3)
-    assert np.linalg.norm(kernels - ours) < 0.01 * np.linalg.norm(kernels)
-    assert lights.shape == (12, 4)
-    np.testing.assert_allclose(lights, moved, atol=0.01 * np.abs(lights).max())
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from stage_runs import SHAPES, stage_run
+from stage_runs import stage_run
 from waiting import PATIENCE_S
 
 from calibration.camera import Camera
@@ -34,9 +34,9 @@ SOFT = {"azimuth": VIEW["azimuth"] + 1.2, "elevation": 0.7, "distance": 600.0, "
 NO_DRAWING = "WebGL2RenderingContext.prototype.drawElements = () => {}"
 
 
-@pytest.fixture(scope="module", params=list(SHAPES))
+@pytest.fixture(scope="module")
 def run(request, tmp_path_factory) -> Path:
-    return stage_run(tmp_path_factory.mktemp("runs"), request.param)
+    return stage_run(tmp_path_factory.mktemp("runs"), getattr(request, "param", "lollipop"))
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +104,7 @@ def test_a_flank_away_from_the_lamp_has_shape(run, tab):
     assert middle > 60  # no hole
 
 
+@pytest.mark.parametrize("run", ["heap"], indirect=True)
 def test_a_soft_shadow_is_that_of_our_renderer_from_the_first_picture_on(run, tab):
     """It was made of copies of a hard one: the first picture had one, and the last had steps."""
     view, lamp = ours(run), light(run, SOFT)
@@ -160,7 +161,7 @@ def boxes(tab, *names: str) -> list[dict]:
     return [box for box in found if box]
 
 
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(("run", "size"), [("lollipop", SIZES[0]), ("heap", SIZES[1])], indirect=["run"])
 def test_the_object_fills_the_part_of_the_window_that_is_free(run, window, size):
     tab, (width, height) = window(*size), size
     for turn in (None, "menu", 2.2, "menu"):

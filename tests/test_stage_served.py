@@ -1,6 +1,7 @@
 """The stage beside viser's page: served to its own page only, with its parts, and its notes kept with the run."""
 
 import json
+import time
 import urllib.error
 import urllib.request
 
@@ -71,7 +72,7 @@ def test_the_result_is_saved_as_other_kinds_of_files_and_as_no_unknown_one(addre
 def eventually(address: str, path: str) -> bytes:
     """What comes once it is made; until then it is a page that says so."""
     while (content := asked(address, path)[1]).startswith(b"<!doctype html>"):
-        pass
+        time.sleep(0.2)
     return content
 
 

@@ -1,21 +1,22 @@
 """Files of strangers: whatever is in them, a reader returns or refuses in words, runs nothing and stays small."""
 
 import io
-import json
 import os
 import random
 import shutil
 import struct
 import tracemalloc
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from dataset_folders import (
     from_above,
+    write_deepshadow,
     write_diligent,
-    write_grey,
     write_rti,
     write_s3nerf,
     write_shadowneus,
@@ -38,18 +39,6 @@ SPITEFUL = (
     *(b"1e999", b"-1e999", b"nan", b"NaN", b"-1", b"0", b"9" * 400, b"9" * 5000, b"null", b"[]", b"{}", b'"x"'),
     *(b"true", b"../../x", b"/etc/passwd", b"\0", b"\xff\xfe", b"[" * 3000, b"1" + b"0" * 30, b"\n" * 50, b"1,5"),
 )
-
-
-def write_deepshadow(folder: Path, truth) -> None:
-    lines = [
-        f"cup_0_{i} {x} {y} {z}" for i, (x, y, z) in enumerate(light.position for light in truth.calibration.lights)
-    ]
-    folder.mkdir()
-    (folder / "all_object_lights.txt").write_text("\n".join(lines) + "\n")
-    given = {"focal_length": 44.0, "cam_location_x": 0.0, "cam_location_y": 0.0, "cam_location_z": 400.0}
-    (folder / "params.json").write_text(json.dumps(given))
-    for i, grey in enumerate(truth.visibility):
-        write_grey(folder / "0" / f"cup_0_{i}_shadow1.png", grey)
 
 
 @pytest.fixture(scope="module")
@@ -132,6 +121,17 @@ def test_a_file_of_lights_with_something_wrong_is_read_or_refused_in_words(scene
 # --- arrays ----------------------------------------------------------------------------------------------------------
 
 
+@contextmanager
+def staying_small() -> Iterator[None]:
+    """Python's own memory stays below 5 MB."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < 5e6
+    finally:
+        tracemalloc.stop()
+
+
 def npy(header: str, data: bytes = b"") -> bytes:
     text = header.encode().ljust(118) + b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + data
@@ -165,28 +165,18 @@ def test_an_array_that_is_none_is_refused_without_running_or_allocating(tmp_path
     (tmp_path / "a.npy").write_bytes(data)
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as packed:
         packed.writestr("light_pose.npy", data)
-    tracemalloc.start()
-    try:
-        with pytest.raises(CalibrationError, match=r"a\.npy"):
-            read_npy(tmp_path / "a.npy")
-        with pytest.raises(CalibrationError, match=r"a\.npz"):
-            read_npz(tmp_path / "a.npz", ("light_pose",))
-        assert tracemalloc.get_traced_memory()[1] < 5e6
-    finally:
-        tracemalloc.stop()
+    with staying_small(), pytest.raises(CalibrationError, match=r"a\.npy"):
+        read_npy(tmp_path / "a.npy")
+    with staying_small(), pytest.raises(CalibrationError, match=r"a\.npz"):
+        read_npz(tmp_path / "a.npz", ("light_pose",))
     assert not Path("/tmp/was_here").exists()
 
 
 def test_an_archive_that_unpacks_to_gigabytes_is_refused_before_it_is_unpacked(tmp_path):
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as packed:
         packed.writestr("light_pose.npy", b"\0" * (80 * 2**20))
-    tracemalloc.start()
-    try:
-        with pytest.raises(CalibrationError, match="unpacks to more than 64 MB"):
-            read_npz(tmp_path / "bomb.npz", ("light_pose",))
-        assert tracemalloc.get_traced_memory()[1] < 5e6
-    finally:
-        tracemalloc.stop()
+    with staying_small(), pytest.raises(CalibrationError, match="unpacks to more than 64 MB"):
+        read_npz(tmp_path / "bomb.npz", ("light_pose",))
 
 
 def test_an_archive_that_lies_about_its_size_gives_no_more_than_it_said(tmp_path):
@@ -195,13 +185,8 @@ def test_an_archive_that_lies_about_its_size_gives_no_more_than_it_said(tmp_path
         packed.writestr("light_pose.npy", b"\0" * (20 * 2**20))
     data = path.read_bytes().replace(struct.pack("<I", 20 * 2**20), struct.pack("<I", 100))
     path.write_bytes(data)
-    tracemalloc.start()
-    try:
-        with pytest.raises(CalibrationError):
-            read_npz(path, ("light_pose",))
-        assert tracemalloc.get_traced_memory()[1] < 5e6
-    finally:
-        tracemalloc.stop()
+    with staying_small(), pytest.raises(CalibrationError):
+        read_npz(path, ("light_pose",))
 
 
 def test_an_archive_whose_name_runs_into_its_data_is_refused_without_quoting_them(tmp_path):

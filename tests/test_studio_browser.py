@@ -4,26 +4,14 @@ import os
 from pathlib import Path
 
 import pytest
-from chromium import CHROMIUM, NO_DRAWING, PATIENCE_MS, SOFTWARE_GL
+from chromium import NO_DRAWING, PATIENCE_MS
 from studio_client import served
 from test_intake import jpeg
-from test_studio import capture_in, program, run_in  # noqa: F401  a fixture
+from test_studio import capture_in, run_in
 
-playwright = pytest.importorskip("playwright.sync_api")
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
-]
+pytestmark = pytest.mark.browser
 DESKTOP, PHONE = {"width": 1600, "height": 1000}, {"width": 390, "height": 844}
 RULES = (Path(__file__).parent / "page_rules.js").read_text()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with playwright.sync_playwright() as started:
-        opened = started.chromium.launch(executable_path=CHROMIUM, args=[*SOFTWARE_GL, "--no-sandbox"])
-        yield opened
-        opened.close()
 
 
 def opened(browser, client, size, is_drawn: bool = True):
@@ -44,7 +32,7 @@ def opened(browser, client, size, is_drawn: bool = True):
     return tab, bad
 
 
-def test_from_an_empty_folder_to_a_run_with_the_mouse_alone(browser, tmp_path, program):  # noqa: F811
+def test_from_an_empty_folder_to_a_run_with_the_mouse_alone(browser, tmp_path, program):
     folder, photos = tmp_path / "studio", tmp_path / "set" / "photos"
     photos.mkdir(parents=True)
     for number in range(4):

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import pytest
-from chromium import CHROMIUM, wait_until
+from chromium import wait_until
 from studio_client import served
-from test_studio import capture_in, program, run_in  # noqa: F401  a fixture
-from test_studio_browser import DESKTOP, PHONE, RULES, browser, opened  # noqa: F401  a fixture
+from test_studio import capture_in, run_in
+from test_studio_browser import DESKTOP, PHONE, RULES, opened
 
 from capture.errors import CaptureError
 from capture.session.session import load_settings
@@ -14,19 +14,8 @@ from capture.session.skipped import photos_of
 from reconstruct.stored_run.stage_pack import opened_pack
 from viewer.studio import example, studio
 
-on_a_page = [
-    pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
-]
 STATE = "window.shadowgraph ? window.shadowgraph.state() : null"
 SMALL = {"width": 1000, "height": 640}
-SIZES = {"desktop": DESKTOP, "phone": PHONE, "small": SMALL}
-
-
-def marked(test):
-    for mark in on_a_page:
-        test = mark(test)
-    return test
 
 
 def stage_of(tab):
@@ -46,7 +35,7 @@ def test_the_example_that_ships_is_small_and_of_the_stage_as_it_is():
     assert example.RESULT.stat().st_size < 500_000
 
 
-def test_the_example_is_a_capture_and_a_run_of_its_own_each_time(tmp_path, program):  # noqa: F811
+def test_the_example_is_a_capture_and_a_run_of_its_own_each_time(tmp_path, program):
     with served(tmp_path, program) as (_, _, owner):
         runs = [owner.ok("try_example") for _ in range(3)]
         cards = {card["key"]: card for card in owner.get("/api/state")[1]["cards"]}
@@ -66,11 +55,11 @@ def test_an_installation_without_the_examples_photos_says_so(tmp_path, monkeypat
     assert status == 400 and "did not come" in answer["error"] and not (tmp_path / "captures").exists()
 
 
-@pytest.mark.parametrize("size", SIZES)
-@marked
-def test_an_empty_studio_shows_a_result_that_the_pointer_lights(browser, tmp_path, size):  # noqa: F811
+@pytest.mark.parametrize("size", [PHONE, SMALL], ids=["phone", "small"])
+@pytest.mark.browser
+def test_an_empty_studio_shows_a_result_that_the_pointer_lights(browser, tmp_path, size):
     with served(tmp_path) as (_, _, owner):
-        tab, bad = opened(browser, owner, SIZES[size], is_drawn=False)
+        tab, bad = opened(browser, owner, size, is_drawn=False)
         stage = stage_of(tab)
         box = tab.locator("iframe.result").bounding_box()
         before = stage.evaluate(STATE)["lamp"]
@@ -79,7 +68,7 @@ def test_an_empty_studio_shows_a_result_that_the_pointer_lights(browser, tmp_pat
         wait_until(tab, lambda: stage.evaluate(STATE)["lamp"]["azimuth"] != before["azimuth"])
         for words in ("New capture", "Try the example"):
             place = tab.locator(f"button:has-text('{words}')").bounding_box()
-            assert place["y"] + place["height"] < SIZES[size]["height"], f"{words} is below the first screen"
+            assert place["y"] + place["height"] < size["height"], f"{words} is below the first screen"
         assert not tab.evaluate(RULES) and not bad
 
 
@@ -87,22 +76,20 @@ def test_an_empty_studio_shows_a_result_that_the_pointer_lights(browser, tmp_pat
 
 
 @pytest.fixture(scope="module")
-def folder(finished_run, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("studio")
-    finished_run(folder / "runs", has_stage=True)
-    capture_in(folder, "vase")
-    run_in(folder, "vase", is_finished=False, message="a level")
-    return folder
+def folder(studio_folder):
+    capture_in(studio_folder, "vase")
+    run_in(studio_folder, "vase", is_finished=False, message="a level")
+    return studio_folder
 
 
-def result_of(browser, owner, size):  # noqa: F811
+def result_of(browser, owner, size):
     tab, bad = opened(browser, owner, size, is_drawn=False)
     tab.goto(f"http://127.0.0.1:{owner.port}/#/run/runs%2Fheap")
     return tab, bad, stage_of(tab)
 
 
-@marked
-def test_one_click_makes_and_downloads_the_page_under_the_title(browser, folder):  # noqa: F811
+@pytest.mark.browser
+def test_one_click_makes_and_downloads_the_page_under_the_title(browser, folder):
     with served(folder) as (_, _, owner):
         title = "Übung & 1"
         owner.ok("rename", key="runs/heap", title=title)
@@ -116,9 +103,9 @@ def test_one_click_makes_and_downloads_the_page_under_the_title(browser, folder)
         tab.close()
 
 
-@pytest.mark.parametrize("button", ["Fill the window", "Rename"])
-@marked
-def test_keys_reach_the_result_while_a_button_has_the_focus(browser, folder, button):  # noqa: F811
+@pytest.mark.browser
+def test_keys_reach_the_result_while_a_button_has_the_focus(browser, folder):
+    button = "Rename"
     with served(folder) as (_, _, owner):
         tab, bad, stage = result_of(browser, owner, SMALL)
         tab.locator(f".bar > :has-text('{button}')").focus()
@@ -134,11 +121,10 @@ def test_keys_reach_the_result_while_a_button_has_the_focus(browser, folder, but
         assert button in tab.evaluate("document.activeElement.innerText") and not bad
 
 
-@pytest.mark.parametrize("size", SIZES)
-@marked
-def test_a_question_mark_lists_the_keys_and_the_picture_alone_fills_the_window(browser, folder, size):  # noqa: F811
+@pytest.mark.browser
+def test_a_question_mark_lists_the_keys_and_the_picture_alone_fills_the_window(browser, folder):
     with served(folder) as (_, _, owner):
-        tab, bad, stage = result_of(browser, owner, SIZES[size])
+        tab, bad, stage = result_of(browser, owner, PHONE)
         tab.focus("button:has-text('Rename')")
         tab.keyboard.press("?")
         wait_until(tab, lambda: stage.evaluate("document.querySelector('dialog[open]') !== null"))
@@ -150,8 +136,8 @@ def test_a_question_mark_lists_the_keys_and_the_picture_alone_fills_the_window(b
 
 
 @pytest.mark.parametrize("width, height", [(360, 640), (1000, 640)])
-@marked
-def test_nothing_to_press_stands_before_the_model(browser, folder, width, height):  # noqa: F811
+@pytest.mark.browser
+def test_nothing_to_press_stands_before_the_model(browser, folder, width, height):
     with served(folder) as (_, _, owner):
         tab, bad, _ = result_of(browser, owner, {"width": width, "height": height})
         model = tab.locator("iframe.result").bounding_box()
@@ -163,8 +149,8 @@ def test_nothing_to_press_stands_before_the_model(browser, folder, width, height
 
 
 @pytest.mark.parametrize("scheme", ["dark", "light"])
-@marked
-def test_every_text_stands_out_also_on_buttons_that_cannot_be_pressed(browser, folder, scheme):  # noqa: F811
+@pytest.mark.browser
+def test_every_text_stands_out_also_on_buttons_that_cannot_be_pressed(browser, folder, scheme):
     with served(folder) as (_, _, owner):
         tab, _ = opened(browser, owner, DESKTOP, is_drawn=False)
         tab.emulate_media(color_scheme=scheme)

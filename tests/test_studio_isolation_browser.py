@@ -1,17 +1,14 @@
 """Pages of runs and captures have no origin in the browser: whatever they hold, they reach nothing of the studio."""
 
 import pytest
-from chromium import CHROMIUM, wait_until
+from chromium import wait_until
 from studio_client import served
 from test_studio import capture_in
-from test_studio_browser import DESKTOP, browser, opened  # noqa: F401  a fixture
+from test_studio_browser import DESKTOP, opened
 
 from reconstruct.stored_run.stage_document import EMPTY
 
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
-]
+pytestmark = pytest.mark.browser
 TRIES = {  # what a page could do to the studio, as far as it runs at all
     "asks": "fetch('/api/state').then((answer) => answer.status)",
     "changes": "fetch('/api/empty_trash', {method: 'POST', body: '{}'}).then((answer) => answer.status)",
@@ -25,12 +22,10 @@ EVIL = "<script>document.title = 'it ran'; fetch('/api/state')</script><img src=
 
 
 @pytest.fixture(scope="module")
-def folder(finished_run, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("studio")
-    run = finished_run(folder / "runs", has_stage=True)
-    (run / "report.html").write_text(f"<title>report</title>{EVIL}")
-    capture_in(folder, "vase")
-    return folder
+def folder(studio_folder):
+    (studio_folder / "runs" / "heap" / "report.html").write_text(f"<title>report</title>{EVIL}")
+    capture_in(studio_folder, "vase")
+    return studio_folder
 
 
 def outcome(frame, code: str) -> str:
@@ -39,7 +34,7 @@ def outcome(frame, code: str) -> str:
 
 
 @pytest.mark.parametrize("way", ["in the studio", "by itself"])
-def test_a_result_reaches_nothing_of_the_studio(browser, folder, way):  # noqa: F811
+def test_a_result_reaches_nothing_of_the_studio(browser, folder, way):
     with served(folder) as (_, _, owner):
         tab, _ = opened(browser, owner, DESKTOP, is_drawn=False)
         address = f"http://127.0.0.1:{owner.port}"
@@ -55,7 +50,7 @@ def test_a_result_reaches_nothing_of_the_studio(browser, folder, way):  # noqa: 
     assert not (folder / "captures").exists()
 
 
-def test_a_result_keeps_its_notes_through_the_page_around_it_and_none_but_its_own(browser, folder):  # noqa: F811
+def test_a_result_keeps_its_notes_through_the_page_around_it_and_none_but_its_own(browser, folder):
     with served(folder) as (_, _, owner):
         tab, _ = opened(browser, owner, DESKTOP, is_drawn=False)
         tab.goto(f"http://127.0.0.1:{owner.port}/#/run/runs%2Fheap")
@@ -72,7 +67,7 @@ def test_a_result_keeps_its_notes_through_the_page_around_it_and_none_but_its_ow
 
 
 @pytest.mark.parametrize("page", ["/report?key=runs/heap", "/check_page?key=vase"])
-def test_pages_with_a_strangers_words_run_no_script_and_have_no_origin(browser, folder, page):  # noqa: F811
+def test_pages_with_a_strangers_words_run_no_script_and_have_no_origin(browser, folder, page):
     with served(folder) as (studio, _, owner):
         verdict = studio.checks.page(folder / "vase")
         verdict.parent.mkdir(parents=True, exist_ok=True)

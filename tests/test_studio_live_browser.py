@@ -9,11 +9,11 @@ import pytest
 from chromium import CHROMIUM, PATIENCE_MS, SOFTWARE_GL, wait_until
 from PIL import Image
 from studio_client import served
-from test_studio_browser import playwright
 
 from calibration.calibration import Calibration
 from shadowgraph import RunOptions, calibrate_source, open_source, read_photos
 
+playwright = pytest.importorskip("playwright.sync_api")
 pytestmark = [
     pytest.mark.browser,
     pytest.mark.slow,

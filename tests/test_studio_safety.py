@@ -143,7 +143,7 @@ def test_no_value_of_a_request_is_a_fault_of_the_program_at_any_address(let_in, 
     query = "&".join(f"{name}={words}" for name in ("key", "photo", "board", "paper", "format", "size", "token"))
     headers = {"Upload-Length": words, "Upload-Metadata": f"filename {words}", "Upload-Offset": words}
     bodies = [json.dumps(dict.fromkeys(NAMES, value))]
-    bodies += [json.dumps(dict.fromkeys(NAMES, "x") | {name: value}) for name in ("key", "title", "token", "name")]
+    bodies += [json.dumps(dict.fromkeys(NAMES, "x") | {name: value}) for name in ("key", "title")]
     for client, app in everybody:
         for route in app.routes:
             address = re.sub(r"\{[^}]*\}", words, route.path) + f"?{query}"

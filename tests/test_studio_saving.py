@@ -125,8 +125,8 @@ def test_a_file_that_failed_keeps_its_sentence_until_it_is_asked_for_anew(folder
         assert not row_of(owner, "3mf")
 
 
-def test_a_run_under_way_shows_its_photos_and_then_the_growing_surface(tmp_path):
-    run, truth = tmp_path / "runs" / "heap", fake_run.make_truth(96, 6)
+def test_a_run_under_way_shows_its_photos_and_then_the_growing_surface(tmp_path, truth):
+    run = tmp_path / "runs" / "heap"
     fake_run.start_run(run, truth)
     (run / "preview.ply").rename(run / "later.ply")
     with served(tmp_path) as (studio, _, owner):

@@ -4,7 +4,7 @@ import json
 from concurrent.futures import Future
 
 import pytest
-from chromium import CHROMIUM, PATIENCE_MS, wait_until
+from chromium import PATIENCE_MS, wait_until
 from studio_client import Client, served
 
 from reconstruct.export.export import export
@@ -19,16 +19,9 @@ NOTED = json.dumps(
 ).encode()
 
 
-@pytest.fixture(scope="module")
-def folder(finished_run, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("studio")
-    finished_run(folder / "runs", has_stage=True)
-    return folder
-
-
-def test_the_stage_is_behind_the_studios_gate(folder):
-    run = folder / "runs" / "heap"
-    with served(folder) as (_, _, owner):
+def test_the_stage_is_behind_the_studios_gate(studio_folder):
+    run = studio_folder / "runs" / "heap"
+    with served(studio_folder) as (_, _, owner):
         page = owner.raw("GET", PAGE)
         policy = page.headers["Content-Security-Policy"]
         assert page.status == 200 and "script-src 'sha256-" in policy and "frame-ancestors 'self'" in policy
@@ -55,11 +48,11 @@ def test_the_stage_is_behind_the_studios_gate(folder):
     (run / "stage.json").unlink()
 
 
-def test_a_damaged_pack_or_one_of_another_solve_counts_as_none(folder, tmp_path):
-    run = folder / "runs" / "heap"
+def test_a_damaged_pack_or_one_of_another_solve_counts_as_none(studio_folder, tmp_path):
+    run = studio_folder / "runs" / "heap"
     pack, mesh = run / STAGE_PACK, run / "mesh.ply"
     whole, surface = pack.read_bytes(), mesh.read_bytes()
-    with served(folder) as (studio, _, _):
+    with served(studio_folder) as (studio, _, _):
         assert isinstance(studio.stage("runs/heap"), StageFiles)
         for content in (whole[:-200], whole.replace(b"first.jpg", b"../rs.jpg"), b""):
             pack.write_bytes(content)
@@ -72,11 +65,10 @@ def test_a_damaged_pack_or_one_of_another_solve_counts_as_none(folder, tmp_path)
 
 
 @pytest.mark.browser
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 @pytest.mark.slow
-def test_a_note_made_in_the_studio_is_kept_with_the_run_and_goes_with_its_export(browser, folder, tmp_path):
-    run = folder / "runs" / "heap"
-    with served(folder) as (_, _, owner):
+def test_a_note_made_in_the_studio_is_kept_with_the_run_and_goes_with_its_export(browser, studio_folder, tmp_path):
+    run = studio_folder / "runs" / "heap"
+    with served(studio_folder) as (_, _, owner):
         address = f"http://127.0.0.1:{owner.port}"
         context = browser.new_context(viewport={"width": 1200, "height": 800})
         name, _, value = owner.cookie.partition("=")

@@ -5,17 +5,13 @@ The draft is a real one, but brief. A picture of each step lies in the test's fo
 
 import pytest
 from brief_drafts import ENVIRONMENT, brief_command
-from chromium import CHROMIUM, PATIENCE_MS, wait_until
+from chromium import PATIENCE_MS, wait_until
 from small_example import small_example
 from studio_client import served
-from test_studio import capture_in, program  # noqa: F401  a fixture
-from test_studio_browser import DESKTOP, PHONE, RULES, browser, opened  # noqa: F401  a fixture
+from test_studio import capture_in
+from test_studio_browser import DESKTOP, PHONE, RULES, opened
 
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
-]
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 STATE = "window.shadowgraph ? window.shadowgraph.state() : null"
 
 
@@ -27,13 +23,12 @@ def finished_stage(tab):
     return tab.frames[-1]
 
 
-@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
-def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp_path, size, monkeypatch):  # noqa: F811
+def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", ENVIRONMENT["PYTHONPATH"])
     photos, steps = small_example(tmp_path / "spot", slice(None, None, 2), slice(None, None, 3)), iter(range(99))
     (photos / "session.toml").unlink()  # a person has none
     with served(tmp_path / "studio", tuple(brief_command())) as (_, _, owner):
-        tab, bad = opened(browser, owner, size)
+        tab, bad = opened(browser, owner, PHONE)
 
         def look(name: str) -> None:
             tab.screenshot(path=tmp_path / f"{next(steps):02d}-{name}.png", full_page=True)
@@ -120,7 +115,7 @@ def press_until(tab, words: str, frame=None) -> None:
     raise AssertionError(f"{words} cannot be reached by the keyboard, only {passed}")
 
 
-def test_the_keyboard_alone_starts_a_run_and_lights_turns_and_edits_a_result(browser, finished_run, tmp_path, program):  # noqa: F811
+def test_the_keyboard_alone_starts_a_run_and_lights_turns_and_edits_a_result(browser, finished_run, tmp_path, program):
     finished_run(tmp_path / "runs", has_stage=True)
     capture_in(tmp_path, "vase")
     with served(tmp_path, program) as (_, _, owner):

@@ -16,8 +16,7 @@ SIZE = 256
 
 
 @pytest.fixture(scope="module")
-def fields():
-    truth = fake_run.make_truth(96, 6)
+def fields(truth):
     return fake_run.fields_of(truth)
 
 

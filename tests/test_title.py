@@ -5,7 +5,6 @@ from urllib.parse import quote
 
 import pytest
 from studio_client import served
-from test_studio import program, run_in  # noqa: F401  a fixture
 from test_studio_saving import RUN, address, made
 
 from capture.errors import CaptureError
@@ -30,8 +29,8 @@ def test_a_title_is_a_name_that_every_system_takes(title, name):
     assert as_name(title, "it") == name and len(name.encode()) < 250
 
 
-@pytest.mark.parametrize("title", [title for title in NAMES if len(title) > 3])
-def test_the_title_that_was_typed_is_on_the_card_the_run_in_the_queue_and_after_a_restart(tmp_path, program, title):  # noqa: F811
+@pytest.mark.parametrize("title", ["A cup / of tea: <b>", "猫" * 100])
+def test_the_title_that_was_typed_is_on_the_card_the_run_in_the_queue_and_after_a_restart(tmp_path, program, title):
     with served(tmp_path, program) as (_, _, owner):
         capture = owner.ok("new", title=f"  {title} ")
         run = owner.ok("start", key=capture, preset="draft")
@@ -56,7 +55,7 @@ def test_a_run_that_has_none_gets_the_title_of_its_capture_and_keeps_its_own(tmp
     assert [title_of(run) for run in runs] == ["Übung 1", "The second"]
 
 
-@pytest.mark.parametrize("title", ["Übung 1", "A <cup> & co", "🏺 vase"])
+@pytest.mark.parametrize("title", ["A <cup> & {{scene}}", "🏺 vase"])
 def test_results_reports_pages_and_files_have_the_title(finished_run, tmp_path, title):
     run = finished_run(tmp_path, has_stage=True)
     assert StoredRun(run).name == "heap" and default_file(run, "glb").name == "heap.glb"
@@ -66,6 +65,7 @@ def test_results_reports_pages_and_files_have_the_title(finished_run, tmp_path, 
     page = StageFiles(run).get("")
     escaped = title.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     assert page is not None and f"<title>{escaped}" in page.content.decode()
+    assert "<cup>" not in page.content.decode()
 
 
 def test_a_file_to_download_is_called_as_its_run_is_now(finished_run, tmp_path):
@@ -84,8 +84,9 @@ def test_a_strangers_title_is_a_line_of_text_or_none(tmp_path, content):
     assert title_of(tmp_path) in (tmp_path.name, "\ufffd\ufffd")
 
 
-@pytest.mark.parametrize("title", ["", "  ", "\n\t", "\ud800"])
-def test_a_title_without_a_letter_is_refused_and_makes_nothing(tmp_path, title):
-    with served(tmp_path) as (studio, _, _), pytest.raises(CaptureError, match="at least one letter"):
-        studio.new_capture(title)
+def test_a_title_without_a_letter_is_refused_and_makes_nothing(tmp_path):
+    with served(tmp_path) as (studio, _, _):
+        for title in ("", "  ", "\n\t", "\ud800"):
+            with pytest.raises(CaptureError, match="at least one letter"):
+                studio.new_capture(title)
     assert not (tmp_path / "captures").exists()

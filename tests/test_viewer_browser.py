@@ -1,13 +1,29 @@
 """The page of a run in a real browser: headless Chromium, its pixels looked at."""
 
+import gc
 import re
+import weakref
 
 import fake_run
 import numpy as np
 import pytest
-from chromium import Followed, brown, canvas_picture, canvas_pixels, open_page, wait_until
+import viser
+from chromium import (
+    NO_DRAWING,
+    PATIENCE_MS,
+    VIEWPORT,
+    Followed,
+    brown,
+    canvas_picture,
+    canvas_pixels,
+    open_page,
+    wait_until,
+)
+from waiting import wait_until as waited_for
 
 from viewer.display.layers import first_view
+from viewer.page.guard import GuardedServer
+from viewer.page.serve import Visitors
 from viewer.report.report import write_report
 
 pytestmark = pytest.mark.browser
@@ -90,3 +106,71 @@ def test_the_report_opens_from_a_file_in_light_and_dark_without_a_complaint(brow
     assert shades[0] > 200 > 60 > shades[1]
     assert not bad
     tab.close()
+
+
+NOT_OURS = "http://192.0.2.1/"  # an address of nobody [RFC 5737]
+
+
+def cut_off(browser, url):
+    """A tab whose network ends at this machine, and every address elsewhere that it asked for."""
+    tab, left = browser.new_page(viewport=VIEWPORT), []
+    tab.set_default_timeout(PATIENCE_MS)
+
+    def only_ours(route):
+        if route.request.url.startswith((url, "data:", "blob:")):
+            route.continue_()
+        else:
+            left.append(route.request.url)
+            route.abort()
+
+    tab.route("**/*", only_ours)
+    tab.add_init_script(NO_DRAWING)
+    tab.goto(url)
+    tab.wait_for_selector("canvas")
+    return tab, left
+
+
+@pytest.mark.parametrize("is_guarded", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_nothing_that_gets_into_the_page_can_send_what_it_sees_elsewhere(browser, truth, tmp_path, is_guarded):
+    fake_run.start_run(tmp_path / "heap", truth)
+    kind = GuardedServer if is_guarded else lambda host, port: viser.ViserServer(host, port, verbose=False)
+    it = Followed(tmp_path / "heap", kind("127.0.0.1", 0))
+    tab, left = cut_off(browser, it.url)
+    tab.evaluate(f"fetch('{NOT_OURS}?what=it+sees', {{mode: 'no-cors'}}).catch(() => 0)")
+    tab.evaluate(f"new Promise(done => {{ const i = new Image(); i.onerror = done; i.src = '{NOT_OURS}'; }})")
+    assert bool(left) != is_guarded
+    tab.close()
+    it.close()
+
+
+@pytest.mark.slow
+def test_what_one_visitor_switches_the_other_does_not_see_and_who_leaves_is_forgotten(browser, truth, tmp_path):
+    run = tmp_path / "heap"
+    fake_run.start_run(run, truth)
+    fake_run.finish_run(run, truth)
+    server = GuardedServer("127.0.0.1", 0)
+    visitors = Visitors(run, server)
+
+    def polled(is_true) -> None:
+        waited_for(lambda: visitors.poll() or is_true())
+
+    try:
+        address = f"http://localhost:{server.get_port()}"
+        tabs = []
+        for number in range(2):
+            tabs.append(open_page(browser, address, is_drawn=False)[0])
+            polled(lambda number=number: len(visitors.pages) == number + 1)
+        pages = list(visitors.pages.values())
+        polled(lambda: all(page._mesh_name == "mesh.ply" for page in pages))
+        tabs[0].get_by_text("Show", exact=True).click()
+        tabs[0].get_by_label("Surface").uncheck()
+        polled(lambda: not pages[0].controls.shows("Surface"))
+        assert pages[1].controls.shows("Surface")
+        gone = weakref.ref(pages.pop(0))
+        tabs[0].close()
+        polled(lambda: list(visitors.pages.values()) == pages)
+        polled(lambda: gc.collect() and gone() is None)  # nothing keeps what was shown to one who has left
+        tabs[1].close()
+        polled(lambda: not visitors.pages)
+    finally:
+        server.stop()
