@@ -9,6 +9,7 @@ import pytest
 from calibration.flashlight.light_estimate import LightFit, surely_placed
 from calibration.ground.ground_field import GroundField
 from calibration.ground.ground_shadows import GROUND_LIKE, bare_ground, find_shadows, of_one_ground
+from calibration.ground.outline_model import witness_odds
 from calibration.light import Light
 
 PHOTOS, HEIGHT, WIDTH = 6, 120, 160
@@ -95,12 +96,13 @@ def test_what_stands_on_a_level_top_belongs_to_the_object_and_the_top_too():
     assert (found & ~lower & ~upper & ~top).sum() < 0.1 * top.sum()
 
 
+@pytest.mark.parametrize("off", [1, 5])  # times the noise
 @pytest.mark.parametrize("look", [(-0.7, 0.0, 0.0), (0.0, 0.5, -0.3), (0.4, -0.3, 0.2)])
-def test_a_part_that_is_lit_nearly_as_the_ground_is_told_by_its_look(look):
-    """A mug of one look throughout: darker, of another hue, or brighter. Its top is nearly as bright as the ground."""
+def test_a_part_that_is_lit_as_the_ground_is_or_nearly_is_told_by_its_look(look, off):
+    """A mug of one look throughout: darker, of another hue, or brighter; its top gets the light that ground gets."""
     top, rng = (np.abs(COLUMNS - 80) < 14) & (ROWS > 22) & (ROWS < 41), np.random.default_rng(1)
     field, whole = _field(FIGURE), FIGURE | top
-    field.residual[:, top] *= 5
+    field.residual[:, top] *= off
     colour = 0.01 * rng.standard_normal((*field.residual.shape, 2))
     colour[:, whole] += look[1:]
     albedo = np.where(whole, look[0], field.albedo).astype(np.float32)
@@ -124,3 +126,15 @@ def test_ground_between_feet_is_ground_though_it_is_mostly_in_shadow(width):
     assert not bare.shadows.object_mask[gap].any() and bare.shadows.object_mask[FIGURE & ~gap].mean() > 0.95
     inside = cv2.erode(gap.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     assert (bare.shadows.visibility[3:, inside] < 0.3).mean() > 0.9 and bare.shadows.visibility[:3, inside].min() > 0.7
+
+
+@pytest.mark.parametrize(("hits", "alarms"), [(0.9, 0.05), (1.0, 0.9), (0.5, 0.5), (0.0, 0.0)])
+def test_a_witness_counts_as_much_as_it_agrees_with_the_region(hits, alarms):
+    """One that calls all an object, or tosses a coin, makes nothing one; silent pixels say nothing."""
+    rng = np.random.default_rng(0)
+    said = np.where(rng.random(FIGURE.shape) < np.where(FIGURE, hits, alarms), 1, -1)
+    said[:10] = 0
+    odds = witness_odds(said, FIGURE)
+    assert np.isfinite(odds).all() and not odds[:10].any()
+    tells = odds[10:].max()
+    assert (tells > 2.0) == (hits > 2 * alarms) and (tells < 0.5) == (hits < 2 * alarms or hits == alarms)

@@ -78,7 +78,7 @@ def test_several_views_find_the_side_that_one_does_not_see(views, solved):
     points = points_on()
     behind = points[points[:, 1] > 15]  # the first camera stands at negative y
     assert error(solved.grid, behind) < 0.75 * error(alone.grid, behind)
-    assert error(solved.grid, points) < 1.0  # mm, of pixels of 4 mm
+    assert error(solved.grid, points) < 1.3  # mm, of pixels of 4 mm; with the true outlines it is 1.0
     before = points[points[:, 1] < -15]
     assert error(solved.grid, before) < 1.1 * error(alone.grid, before)  # views more never make it worse
 

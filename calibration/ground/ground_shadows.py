@@ -8,7 +8,14 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import label
 
 from calibration.ground.ground_field import GroundField, Maps
-from calibration.ground.outline_model import ODDS, ObjectAndGround, dark_levels, object_and_ground, shadowed_inside
+from calibration.ground.outline_model import (
+    ODDS,
+    ObjectAndGround,
+    Witness,
+    dark_levels,
+    object_and_ground,
+    shadowed_inside,
+)
 
 GROUND_LIKE = -0.3  # mean log likelihood ratio of a photo below which a pixel is ground
 LIKELY = -0.1  # the same, from which a pixel is none
@@ -40,10 +47,14 @@ def find_shadows(field: GroundField) -> GroundShadows:
     return bare_ground(field).shadows
 
 
-def bare_ground(field: GroundField) -> BareGround:
-    """Return the shadows and the object, and the ground under both as far as the photos tell it."""
+def bare_ground(field: GroundField, witness: Witness | None = None) -> BareGround:
+    """Return the shadows and the object, and the ground under both as far as the photos tell it.
+
+    Args:
+        witness: see object_and_ground.
+    """
     seam = None if field.beyond is None else _seam(field.beyond)
-    found = object_and_ground(field, seam)
+    found = object_and_ground(field, seam, witness)
     likelihood = cv2.GaussianBlur(found.brightness, (0, 0), 0.7)
     if field.beyond is not None:
         likelihood = np.where(field.beyond | seam, np.float32(ODDS), likelihood)

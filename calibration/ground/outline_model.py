@@ -5,7 +5,7 @@ and c_k its colour (two log ratios of channels):
 
     open ground        r_k is near 0 (lit) or near the photo's dark level d_k (in shadow); any albedo
     ground in a gap    the albedo and colour of the ground around; lit or, mostly, in shadow; shadow has its own tint
-    object             r_k is anything, c_k is the pixel's own
+    object             r_k is anything, or a small step from 0 where it is level; c_k is the pixel's own
 
 Log odds of object over ground are summed over photos and divided by how many photos one independent photo is worth,
 which the spread of the sums on ground tells. The look is added: a histogram of albedo and colour for ground, learned
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Integer
 from scipy.ndimage import find_objects, gaussian_filter, label
 
 from calibration.ground.ground_field import DARK, DARKEST, GroundField, Maps
@@ -33,11 +33,12 @@ FEWEST_DARK = 30  # pixels that measure a photo's dark level
 DARK_WIDTH, OBJECT_WIDTH = 0.35, 0.9  # log units: how much shadows and the object's brightness vary
 ODDS = 2.0  # largest log likelihood ratio that one photo may add
 SHADOW_SHARE, GAP_SHARE, DARK_SHARE = 0.2, 0.75, 0.3  # of the samples in shadow: open ground, ground in a gap, object
+LEVEL_SHARE = 0.2  # of an object's pixels, that face up: most of a coin's, few of a figure's
 FEWEST_PHOTOS = 3  # that show a pixel: fewer tell nothing of it
 FOLLOWS = 0.6  # share of the photos from which a pixel tells what ground is like
 BINS = 16  # of each axis of a look
 STRANGE = 0.02  # share of either that looks like nothing else of it
-AWAY = (0.5, 0.25, 0.1, 0.0)  # of the object's extent: other parts of it lie nearer; the first that leaves ENOUGH
+AWAY = (1.0, 0.5, 0.25, 0.1, 0.0)  # of what is found: the object's other parts lie nearer; the first that leaves ENOUGH
 ENOUGH = 0.2  # of the picture, of ground that tells its look
 AROUND = 0.6  # of the root of the object's area: sigma of the window whose ground tells the albedo in a gap
 LINK = 8.0  # nats: cost of a cut between alike neighbours
@@ -49,6 +50,7 @@ RIM = np.ones((7, 7), np.uint8)  # of the object: ground so near it may be a par
 
 Map = Float[np.ndarray, "height width"]
 Region = Bool[np.ndarray, "height width"]
+Witness = Integer[np.ndarray, "height width"]  # 1 object, -1 ground, 0 silent
 Look = Float[np.ndarray, "height width 3"]  # log albedo and two log ratios of channels
 
 
@@ -63,11 +65,14 @@ class ObjectAndGround:
     albedo: Map  # log, of the ground: there that of the ground around
 
 
-def object_and_ground(field: GroundField, unknown: Region | None = None) -> ObjectAndGround:
+def object_and_ground(
+    field: GroundField, unknown: Region | None = None, witness: Witness | None = None
+) -> ObjectAndGround:
     """Tell object from ground; the region may have several parts, and reach the picture's border.
 
     Args:
         unknown: pixels whose brightness tells nothing; None: none of them.
+        witness: another's outline, which counts as far as it agrees with the region.
     """
     samples = _Samples(field)
     usable = field.usable if unknown is None else field.usable & ~unknown
@@ -84,17 +89,32 @@ def object_and_ground(field: GroundField, unknown: Region | None = None) -> Obje
         if not thing.any():
             break
         near, scatter = samples.around(region, thing)
-        raised = np.clip(worth * samples.raised_odds(usable, thing), -SURE, SURE)
+        raised = np.clip(worth * samples.raised_odds(usable, thing), 0, SURE)  # a level part's step may be nothing
+        shown = np.logaddexp(np.log(1 - LEVEL_SHARE) + by_light, np.log(LEVEL_SHARE) + raised)
         in_gap = worth * (samples.gap_odds(near, scatter, thing) * usable).sum(0) / np.maximum(count, 1)
-        in_gap = np.where(told, np.clip(in_gap, -SURE, SURE), SURE)
-        odds = by_light + samples.look_odds(region, thing)
+        said = 0.0 if witness is None else witness_odds(witness, region)
+        in_gap = np.where(told, np.clip(in_gap + shown - by_light + said / 2, -SURE, SURE), SURE)
+        beside = shown + samples.look_odds(region, thing) + said
+        before, either = region, np.minimum(beside, in_gap)
+        if not (after := _cut(either, links)).any():  # a gap lies beside an object: not all of it is one
+            break
         shaded = ((field.residual + field.albedo - near[..., 0] < DARK) & usable).sum(0) >= count / 2
-        gaps, odds = (odds > 0) & (in_gap < 0) & shaded, np.maximum(np.minimum(odds, in_gap), raised)
+        gaps, odds, region = (beside > 0) & (in_gap < 0) & shaded, either, after
         albedo = np.where(gaps, near[..., 0], field.albedo)
-        before, region = region, _cut(odds, links)
         if (region == before).all():
             break
     return ObjectAndGround(region, mean.astype(np.float32), odds, gaps & ~region, albedo)
+
+
+def witness_odds(witness: Witness, region: Region) -> Map:
+    """Return log odds of object over ground by what a witness says: log(hits / false alarms), or that of their rests.
+
+    Both rates are counted against the region [Dawid and Skene 1979]. Ground in a gap is called an object as often as
+    the geometric mean of the two says, so that half of this counts there.
+    """
+    hits, alarms = (((witness > 0) & of).sum(dtype=float) + 1 for of in (region, ~region))
+    hits, alarms = hits / (((witness != 0) & region).sum() + 2), alarms / (((witness != 0) & ~region).sum() + 2)
+    return (witness != 0) * np.where(witness > 0, np.log(hits / alarms), np.log((1 - hits) / (1 - alarms)))
 
 
 def _worth(single: Maps, lit: Bool[np.ndarray, "photos height width"]) -> float:

@@ -9,8 +9,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from scipy.ndimage import label, mean
+from jaxtyping import Bool, Float, Int8
+from scipy.ndimage import label
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -57,10 +57,10 @@ AMBIENT_SHARE = 0.7  # of the light in shadows on the ground: the rest comes fro
 def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     """Classify pixels as object or ground, and label the shadows on it: by the lights' model, or by a field of light.
 
-    The field is used where the model makes much less of the picture ground than the field does. Elsewhere both tell the
-    outline, see _common_outline, or the field alone where the model explains less than EXPLAINED, and the photos'
-    powers decide whose light is right, see _powers_off. How quiet the fits are is no evidence: the field bends to what
-    it is fitted to, and so do the model's gains.
+    The outline is the field's, to which the model is one more witness, see _witness; it is the model's where the field
+    tells none. The model's light is used unless it makes much less of the picture ground than the field does, or the
+    photos' powers contradict it, see _powers_off. How quiet the fits are is no evidence: the field bends to what it is
+    fitted to, and so do the model's gains.
 
     Args:
         before: of the same photos under other lights; what does not depend on them is taken from it.
@@ -83,20 +83,20 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     points, eye = ground_points(scene).double().numpy(), scene.eye.double().numpy()
     beyond = seen_beyond(rgb, usable, points, eye)
     field = at_photo_size(fit_ground_field(rgb, usable, beyond), rgb, usable)
-    bare = bare_ground(_with_dark_samples(field, usable))
+    whole = _with_dark_samples(field, usable)
     # Beyond the ground's end, too, light is smooth and shadows fall, but on no ground.
-    background = None if beyond is None else torch.from_numpy(beyond & ~bare.shadows.object_mask)
+    background = None if beyond is None else torch.from_numpy(beyond & ~bare_ground(whole).shadows.object_mask)
     by_model = tested if background is None else test_ground(scene, background)
     share = float((field.follows > FOLLOWS).mean())
-    is_explained = by_model.explained >= EXPLAINED
-    if not is_explained and share > tested.explained + GAINED:
-        return _by_field(scene, bare)
-    if share < EXPLAINED:
+    follows_more = by_model.explained < EXPLAINED and share > tested.explained + GAINED
+    if share < EXPLAINED and not follows_more:
         return by_model
-    outline = _common_outline(scene, by_model, bare) if is_explained else _mask(scene, bare)
-    if _powers_off(scene, field, by_model) < POWERS_OFF:
-        return test_ground(scene, background, outline)
-    return _by_field(scene, bare, outline)
+    bare = bare_ground(whole, _witness(by_model))
+    if not bare.shadows.object_mask.any():
+        return by_model
+    if follows_more or _powers_off(scene, field, by_model) >= POWERS_OFF:
+        return _by_field(scene, bare)
+    return test_ground(scene, background, _mask(scene, bare))
 
 
 def _with_dark_samples(field: GroundField, usable: Bool[np.ndarray, "photos height width"]) -> GroundField:
@@ -127,38 +127,13 @@ def _powers_off(scene: Scene, field: GroundField, tested: GroundTest) -> float:
     return float((typical - typical.median()).square().mean().sqrt()) if len(typical) else 0.0
 
 
-def _common_outline(scene: Scene, by_model: GroundTest, bare: BareGround) -> Outline:
-    """Return the outline that the lights' model and the field tell together.
+def _witness(by_model: GroundTest) -> Int8[np.ndarray, "height width"]:
+    """Return what the lights' model says of each pixel, see object_and_ground.
 
-    The model tells the object's level tops from the ground by their height, which no field does. In a gap at a contact
-    it misses the light that the object sends there, while the field compares each sample with lit ground and with
-    shadow: gaps are the field's. An object much darker than the ground is ground in shadow to a model whose lights are
-    off, and highlights on the ground or on a wall are objects: the field's object is added, but for holes in it that
-    both call ground. A part of the model's that does not touch it stays only if the field sees no ground there either,
-    nor what lies behind the ground's end.
+    It tells the object's level tops from the ground by their height, which no field does.
     """
-    if scene.mask is not None:
-        return Outline(by_model.mask, by_model.mask_confidence)
-    assert scene.rgb is not None
-    by_field = bare.shadows.object_mask
-    drawn = (by_model.mask > 0.5).numpy()
-    region = drawn & (~bare.types.gaps | by_field)
-    if by_field.any():
-        parts = np.empty(region.shape, np.int32)
-        label(region, np.ones((3, 3), np.uint8), output=parts)
-        strange = (bare.shadows.likelihood > LIKELY) & (True if bare.field.beyond is None else ~bare.field.beyond)
-        touching = cv2.dilate(by_field.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        kept = np.asarray(mean(strange, parts, np.arange(parts.max() + 1))) > 0.5
-        kept[np.unique(parts[touching])] = True
-        kept[0] = False
-        is_hole = (bare.shadows.likelihood <= LIKELY) & (by_model.mask_confidence > 0.5).numpy()
-        found = torch.from_numpy((by_field & ~is_hole) | kept[parts])
-        region = object_region(found, torch.ones_like(found)).numpy()
-    sure = _confidence(bare.types.odds)
-    added, removed = (torch.from_numpy(one) for one in (region & ~drawn, drawn & ~region))
-    mask = torch.where(added | removed, coverage_at_edges(scene.rgb, torch.from_numpy(region)), by_model.mask)
-    confidence = torch.where(added, sure, torch.where(removed, GAP_CONFIDENCE, by_model.mask_confidence))
-    return Outline(mask, confidence)
+    said = np.where(by_model.mask.numpy() > 0.5, 1, -1)
+    return (said * (by_model.mask_confidence.numpy() > 0)).astype(np.int8)
 
 
 def _by_field(scene: Scene, bare: BareGround, outline: Outline | None = None) -> GroundTest:
