@@ -56,6 +56,16 @@ def test_a_second_light_that_came_or_went_is_told_where_powers_are_hardly_known(
     assert found is not None and (found.spoilt() == both).all()
 
 
+@pytest.mark.parametrize("photos", [range(8), range(19, 27), range(0, 27, 2)], ids=str)
+@pytest.mark.parametrize("more", [0.003, 0.006, 0.02])
+def test_photos_with_lighter_shadows_that_are_no_brighter_have_no_second_light(photos, more):
+    rng, n = np.random.default_rng(2), 27
+    lighter = np.isin(np.arange(n), photos)
+    in_shadow = 0.004 + more * lighter + 0.0005 * rng.normal(size=n)
+    noise = 0.001 * rng.normal(size=n), 0.07 * rng.normal(size=n)
+    assert find_mixture(PhotoLight(noise[0], in_shadow, noise[1], rng.random(n) < 0.8)) is None
+
+
 @pytest.mark.parametrize(("ratio", "first"), [(0.75, 9), (1.6, 12)])
 def test_a_flashlight_that_changes_its_power_is_told_from_which_photo_on(lights, ratio, first):
     stack = photograph(

@@ -128,15 +128,18 @@ def _settled(
 def _costs(light: PhotoLight, groups: Bool[np.ndarray, " photos"], cause: str) -> Float[np.ndarray, "2 photos"]:
     """Return each photo's cost outside and inside the group, if the groups differ for that cause; "": they do not.
 
-    A second light adds light everywhere: it makes photos brighter, shadows too, and no shadow clearer. With the power
-    goes some of the light in the shadows: what the flashlight's own light reaches, or all of it with the exposure.
+    A second light adds light everywhere: it makes photos brighter, shadows too, and no shadow clearer; photos that are
+    not brighter than one flashlight's power varies have none. With the power goes some of the light in the shadows:
+    what the flashlight's own light reaches, or all of it with the exposure.
     """
     second, power, in_shadow = cause == "second light", _apart(light.log_power, groups), light.in_shadow
+    if second and power <= STEADY:
+        return np.full((2, len(groups)), np.inf)
     if cause == "power":
         own_shadow = _apart(in_shadow, groups) * _apart(in_shadow * np.exp(-power * groups), groups) < 0
     else:
         own_shadow = second and _apart(in_shadow, groups) > 0
-    table = costs(light.log_power, groups, STEADY, cause != "" and (not second or power > 0))
+    table = costs(light.log_power, groups, STEADY, cause != "")
     table = table + costs(in_shadow, groups, ALIKE, own_shadow)
     table += costs(light.log_misfit, groups, MISFIT, second and _apart(light.log_misfit, groups) > 0)
     share, all_of = [_share(light.one_depth[some]) for some in (~groups, groups)], _share(light.one_depth)
