@@ -220,6 +220,12 @@ def angles(vectors):
     return np.arctan2(vectors[:, 1], vectors[:, 0]), np.arcsin(vectors[:, 2])
 
 
+def angles_of(around: str, second: str) -> dict[str, np.ndarray]:
+    """In degrees, one column and one row, the second from the axis of view where it is called theta."""
+    azimuth, up = np.degrees(angles(unit_directions()))
+    return {around: azimuth[:, None], second: (90 - up if second == "theta" else up)[None]}
+
+
 @pytest.mark.parametrize(
     ("head", "columns"),
     [
@@ -264,6 +270,15 @@ def test_a_table_of_places_is_read_as_places(tmp_path, head, scale, kind):
         (lambda: {"L": unit_directions(), "mask": np.ones((3, 5)), "note": "by hand"}, "directional"),
         (lambda: {"light_directions": unit_directions().T, "albedo": np.ones((4, 3))}, "directional"),
         (lambda: {"S": directions(), "Dir": unit_directions(), "Phi": np.ones((4, 3))}, "point"),
+        (
+            lambda: {"light_vectors": unit_directions(), "K": np.eye(3), "light_intensities": np.ones((4, 3))},
+            "directional",
+        ),
+        (lambda: {"LightMatrix": unit_directions().T, "K": np.eye(3)}, "directional"),
+        (lambda: {"dirLight": unit_directions(), "R": np.eye(3), "t": np.ones((3, 1))}, "directional"),
+        (lambda: {"LED_pos": directions(), "led_power": np.ones((4, 3))}, "point"),
+        (lambda: angles_of("azimuth", "elevation") | {"K": np.eye(3)}, "directional"),
+        (lambda: angles_of("phi", "theta"), "directional"),
         (lambda: {"anything": np.round(unit_directions(), 4).astype(np.float32)}, "directional"),
     ],
 )

@@ -28,9 +28,10 @@ DIRECTIONS, PLACES = ("l", "d", "dir", "direction", "n"), ("p", "pos", "position
 AZIMUTH = ("azimuth", "azi", "az", "phi")
 ELEVATION = ("elevation", "elev", "el", "altitude", "alt")
 POLAR = ("polar", "zenith", "theta", "inclination", "colatitude")
-ARRAYS = (  # usual names of the lights in .mat files, without _ and capitals
-    *("lightdirections", "lightdirection", "lightdirs", "lightdir", "directions", "dirs", "lightpositions", "lightpos"),
-    *("lightsources", "lights", "light", "positions", "sources", "l", "s"),
+ARRAYS = (  # names of the lights in .mat files, the clearest first, without _ and capitals
+    re.compile("(?=.*(light|led|source)).*(dir|vec).*|directions|dirs"),
+    re.compile("(?=.*(light|led|source)).*pos.*|positions"),
+    re.compile("(light|led|source)s?(matrix|mat)?|l|s"),
 )
 NEEDED = "a name and x y z of its light are needed"
 
@@ -172,7 +173,7 @@ def _cells(line: str) -> list[str]:
 
 
 def _mat_rows(path: Path, posed_camera: PosedCamera) -> Rows:
-    """Read MATLAB's file: the array of three columns, or rows, that has a usual name, or is the only one.
+    """Read MATLAB's file: the array of three columns, or rows, that has a usual name or is the only one, or two angles.
 
     Raises:
         CalibrationError: it cannot be read, or holds no such array; names those it has.
@@ -182,8 +183,14 @@ def _mat_rows(path: Path, posed_camera: PosedCamera) -> Rows:
     except CalibrationError as error:
         raise CalibrationError(f"{error} {READABLE}.") from error
     fit = [name for name, array in known.items() if array.ndim == 2 and 3 in array.shape]
-    usual = sorted((name for name in fit if _plain(name) in ARRAYS), key=lambda name: ARRAYS.index(_plain(name)))
+    usual = [name for names in ARRAYS for name in fit if names.fullmatch(name.lower().replace("_", ""))]
     chosen = usual[0] if usual else fit[0] if len(fit) == 1 else None
+    head = None if usual else Head.of(list(known))
+    if head is not None and head.kind == "angles":
+        angles = [known[list(known)[place]].ravel() for place in head.places]
+        if len({len(one) for one in angles}) == 1 and np.isfinite(angles).all():
+            vectors, note = head.vectors(np.stack(angles, axis=-1), path)
+            return Rows((None,) * len(vectors), turned(vectors, posed_camera), "directional", note=note)
     if chosen is None:
         shown = ", ".join(f"{name} {' x '.join(map(str, array.shape))}" for name, array in [*known.items()][:8])
         raise CalibrationError(
@@ -191,10 +198,6 @@ def _mat_rows(path: Path, posed_camera: PosedCamera) -> Rows:
             f"L or S was needed, or one only. {READABLE}."
         )
     return _array_rows(known[chosen], chosen, path, posed_camera)
-
-
-def _plain(name: str) -> str:
-    return name.lower().replace("_", "")
 
 
 def _array_rows(values: Float[np.ndarray, "..."], name: str, path: Path, posed_camera: PosedCamera) -> Rows:
