@@ -48,9 +48,10 @@ LARGE = 100_000  # entries of a list that was made long
 SPARSE = 8 << 30  # bytes that a file says it has
 
 
-def make(folder: Path, width: int = 64, n_lights: int = 6) -> Path:
+def make(folder: Path, has_stage: bool = True) -> Path:
     """A finished run with every file that one may hold."""
-    truth = fake_run.make_truth(width, n_lights)
+    n_lights = 6
+    truth = fake_run.make_truth(64, n_lights)
     run = folder / "heap"
     fake_run.start_run(run, truth)
     fake_run.finish_run(run, truth)
@@ -81,13 +82,14 @@ def make(folder: Path, width: int = 64, n_lights: int = 6) -> Path:
     note = {"kind": "arrow", "text": "here", "at": [0.0, 0.0, 20.0], "normal": [0.0, 0.0, 1.0]}
     saved = {"name": "a view", "view": view, "lamp": lamp, "look": "photo"}
     _write(run / "stage.json", {"format": 1, "notes": [note], "views": [saved], "crop": None, "guess": "shown"})
-    write_stage(run)
+    if has_stage:
+        write_stage(run)
     return run
 
 
 def make_several(folder: Path) -> Path:
     """The same run with a second view, the object laid anew, a view that was left out, and a photo from the side."""
-    run = make(folder)
+    run = make(folder, has_stage=False)
     motion = Pose(Rotation.from_euler("z", 40, degrees=True).as_matrix(), np.array([80.0, -30.0, 0.0]))
     own, back = load_calibration(run / "calibration.json"), motion.inverse()
     own = replace(own, side_views=(_side_view(own),))
@@ -111,7 +113,6 @@ def make_several(folder: Path) -> Path:
             (run / name / file).write_bytes((run / file).read_bytes())
         for small in sorted((run / "thumbs").glob("photo_*.jpg")):
             small.with_name(f"{name}-{small.name}").write_bytes(small.read_bytes())
-    (run / "stage.zip").unlink()
     write_stage(run)
     return run
 

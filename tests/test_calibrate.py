@@ -14,6 +14,7 @@ import calibration.calibrate_with_file as from_file
 from calibration.calibrate import calibrate
 from calibration.calibrate_with_file import calibrate_with_file
 from calibration.calibration import load_calibration, save_calibration
+from calibration.flashlight.light_estimate import LightFit
 from calibration.flashlight.phone import PhoneViews
 from calibration.light import Light
 from calibration.outlines.metric_cues import MetricCues
@@ -27,12 +28,17 @@ from capture.session.session import Session, SessionSettings
 FLAT_SHEET = SimpleNamespace(on_sheet=lambda corners: corners)
 
 
+@pytest.fixture(scope="module")
+def photographed():
+    return photograph(Recipe(n_photos=8))
+
+
 @pytest.fixture
-def truth(monkeypatch):
+def truth(monkeypatch, photographed):
     residuals = {"board": "checkerboard:9x6:20", "notes": [], "pose_covariance": np.zeros((6, 6)).tolist()}
     found = (POSED_CAMERA, residuals)
     monkeypatch.setattr(glue, "fit_board", lambda session, spec: (found[0], FLAT_SHEET, found[1]))
-    return photograph(Recipe(n_photos=8))
+    return photographed
 
 
 def session_of(truth) -> Session:
@@ -125,7 +131,7 @@ def test_an_unknown_way_to_find_lights_is_the_callers_mistake(truth):
 
 
 def test_a_photo_of_the_phones_back_that_tells_nothing_is_named_and_does_not_stop_the_calibration(truth, monkeypatch):
-    fitted = glue.locate_lights(truth.stack, POSED_CAMERA, np.ones(8, bool))
+    fitted = LightFit(truth.lights, (), np.zeros(3), {"cue": ""})
     led = {"led_offset_mm": [12.0, -5.0, 0.0], "led_offset_sigma_mm": 2.0}
     with_phone = replace(fitted, residuals=fitted.residuals | {"phone_photos": {}} | led)
     told = []
