@@ -8,9 +8,19 @@ import numpy as np
 from synthetic import Truth
 
 from calibration.camera import Camera
+from calibration.known_scene import KnownScene
 from calibration.light import Light
 from calibration.pose import Pose
+from calibration.scenes.importers import find_importer
 from capture.photos.photo import encode_srgb
+
+
+def loaded(folder: Path) -> KnownScene:
+    """A folder of another program, by the importer that knows it."""
+    importer = find_importer(folder)
+    assert importer is not None
+    return importer.load(folder, "train")
+
 
 OPENGL = np.diag([1.0, -1.0, -1.0])  # camera axes x right, y up, z back, from OpenCV's
 

@@ -74,3 +74,8 @@ def save_photo(path: Path, linear: np.ndarray, model: str = "Tripod", second: in
     tags.get_ifd(0x8769)[36867] = f"2024:01:01 12:{second // 60:02d}:{second % 60:02d}"
     Image.fromarray(encode_srgb(linear)).save(path, quality=95, exif=tags.tobytes())
     return path
+
+
+def moved(rgb, u, v):
+    shift = np.array([[1, 0, u], [0, 1, v]], float)
+    return cv2.warpAffine(rgb, shift, rgb.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)

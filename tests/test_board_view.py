@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import lit_table
 import numpy as np
 import pytest
@@ -39,13 +38,10 @@ def a_board(rgb):
     return replace(lit_table.stack_of([rgb]), paths=(Path("board/IMG_0.jpg"),))
 
 
-def moved(rgb, u, v):
-    shift = np.array([[1, 0, u], [0, 1, v]], float)
-    return cv2.warpAffine(rgb, shift, rgb.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-
-
 def pushed_from(stack, first, u=4.0, v=-3.0):
-    return replace(stack, rgb=np.stack([moved(rgb, u, v) if k >= first else rgb for k, rgb in enumerate(stack.rgb)]))
+    return replace(
+        stack, rgb=np.stack([lit_table.moved(rgb, u, v) if k >= first else rgb for k, rgb in enumerate(stack.rgb)])
+    )
 
 
 def names(findings):
@@ -65,7 +61,7 @@ def test_the_larger_group_counts_where_the_board_belongs_to_it_or_tells_nothing(
     assert names(check_stack(pushed, board=board)) == later
     other = a_board(lit_table.photograph(0.6 * lit_table.table(of(7)), of(8)))
     assert names(check_stack(pushed, board=other)) == later
-    after = a_board(moved(board.rgb[0], 4, -3))
+    after = a_board(lit_table.moved(board.rgb[0], 4, -3))
     assert names(check_stack(pushed, board=after)) == [(f"IMG_{k}.jpg", BOARD_OFF, True) for k in range(8)]
 
 

@@ -24,11 +24,6 @@ def with_photo(stack, index, rgb):
     return replace(stack, rgb=changed)
 
 
-def moved(rgb, u, v):
-    shift = np.array([[1, 0, u], [0, 1, v]], float)
-    return cv2.warpAffine(rgb, shift, rgb.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-
-
 def dropped(findings):
     return [(finding.photo.name, finding.kind) for finding in findings if finding.drop]
 
@@ -61,7 +56,7 @@ def test_over_exposure_warns_first_and_drops_later(stack):
 
 @pytest.mark.parametrize(("u", "v"), [(3, 0), (-2, 2), (0, 6)])
 def test_a_shifted_photo_is_found_and_its_shift_measured(stack, u, v):
-    (finding,) = check_stack(with_photo(stack, 7, moved(stack.rgb[7], u, v)))
+    (finding,) = check_stack(with_photo(stack, 7, lit_table.moved(stack.rgb[7], u, v)))
     assert finding.kind == "camera moved" and finding.photo.name == "IMG_7.jpg" and finding.drop
     assert finding.value == pytest.approx(np.hypot(u, v), abs=0.3)  # px of a file as large as the stack
 
@@ -117,7 +112,7 @@ def test_half_a_pixel_across_the_grain_of_wood_is_told_though_shadows_differ_by_
     wood = lit_table.with_object(0.4 * np.exp(0.02 * grain / grain.std()))
     good = lit_table.stack_of(lit_table.lit_photos(N, rng, wood))
     assert check_stack(good) == ()
-    (finding,) = check_stack(with_photo(good, 4, moved(good.rgb[4], 0.2, 0.5)))
+    (finding,) = check_stack(with_photo(good, 4, lit_table.moved(good.rgb[4], 0.2, 0.5)))
     assert (finding.photo.name, finding.kind) == ("IMG_4.jpg", "camera moved")
 
 

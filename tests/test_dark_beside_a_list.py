@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from dataset_folders import towards_lights, write_diligent, write_photo, write_rti
+from dataset_folders import loaded, towards_lights, write_diligent, write_photo, write_rti
 from synthetic import BALL, Look, render
 from test_importers import from_above
 
-from calibration.scenes.importers import find_importer, import_folder
+from calibration.scenes.importers import import_folder
 from reconstruct.source.photos import read_photos
 from reconstruct.source.source import RunOptions, open_source
 
@@ -73,8 +73,6 @@ def test_those_that_cannot_be_are_said(tmp_path, picture, words):
     dark, curve = rti(tmp_path, truth)
     dark.mkdir()
     write_photo(dark / "a.png", picture, curve) if picture is not None else (dark / "a.png").write_text("no picture")
-    importer = find_importer(tmp_path)
-    assert importer is not None
-    known = importer.load(tmp_path, "train")
+    known = loaded(tmp_path)
     said = known.calibration.residuals["warnings"]
     assert known.dark_paths == () and any("dark is not used: " in text and words in text for text in said)

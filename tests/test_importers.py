@@ -9,6 +9,7 @@ import scipy.io
 import torch
 from dataset_folders import (
     from_above,
+    loaded,
     places,
     towards_lights,
     write_diligent,
@@ -43,12 +44,6 @@ STONE = (Box((-200, -200, 0), (200, 200, 30)), Sphere((0, 0, 30), 25), Sphere((-
 def seen_from_above(shapes=(BALL,), side=64, n_lights=12):
     look = Look(width=side, height=side, n_lights=n_lights, kind="directional")
     return render(shapes, look, from_above(side))[1]
-
-
-def loaded(folder):
-    importer = find_importer(folder)
-    assert importer is not None
-    return importer.load(folder, "train")
 
 
 def scene_of(folder, **options):

@@ -9,7 +9,7 @@ from reconstruct.appearance.joint_fit import fit_normals
 from reconstruct.appearance.lobe_fit import Samples
 
 PIXELS, PHOTOS = 300, 24
-LIT, SHADOWED = 0.02, 0.5  # of what the tilted start is off: without noise, and with shadows
+LIT = 0.02  # of what the tilted start is off, without noise
 
 
 def samples(is_glossy: bool) -> tuple[Samples, torch.Tensor, torch.Tensor, torch.Tensor]:

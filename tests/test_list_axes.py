@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from dataset_folders import write_photo
+from dataset_folders import loaded, write_photo
 from PIL import Image
 
-from calibration.scenes.importers import find_importer
 from calibration.scenes.list_axes import UPRIGHT, WAYS
 from capture.photos.photo import encode_srgb
 
@@ -66,12 +65,6 @@ def stored(upright, orientation):
     undo |= {5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_90, 7: Image.Transpose.TRANSVERSE}
     undo[8] = Image.Transpose.ROTATE_270
     return np.asarray(Image.fromarray(upright).transpose(undo[orientation]))
-
-
-def loaded(folder):
-    importer = find_importer(folder)
-    assert importer is not None
-    return importer.load(folder, "train")
 
 
 def warnings_of(folder):

@@ -24,7 +24,6 @@ from viewer.page.guard import GuardedServer, InvalidMessage, is_loopback, refuse
 from viewer.page.serve import address_lines, view
 
 ANY_PORT = 0
-FRAMES, FRAMES_AT_ONCE = 10_000, 200
 REFUSED = 1008  # how a WebSocket is closed that sends what the page does not
 
 
