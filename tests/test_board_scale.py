@@ -52,9 +52,10 @@ def found(tmp_path, spec, tags):
         ("charuco:5x7:3:2.2:DICT_4X4_50", {FOCUS: IFDRational(6, 10)}, "in centimetres it would be 30 mm"),
     ],
 )
-def test_a_board_typed_in_another_unit_is_doubted_and_the_unit_named(tmp_path, spec, tags, unit):
+def test_a_board_typed_in_another_unit_is_doubted_and_the_unit_named(tmp_path, caplog, spec, tags, unit):
     residuals, doubts = found(tmp_path, spec, tags)
     (doubt,) = doubts
+    assert caplog.messages == doubts  # before lights are looked for
     assert unit in doubt and "Measure a square" in doubt and "smaller than a stamp" in doubt
     assert scale_parts(residuals) == (f"one square = {parse_board(spec).square_mm:g} mm", "as you typed it")
 

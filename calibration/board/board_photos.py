@@ -1,5 +1,6 @@
 """Estimate camera and ground from the board in the photos of a session, or of several views that share a lens."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from capture.errors import CalibrationError, Remedy
 from capture.photos.photo import read_photo
 from capture.session.session import Session
 
+LOG = logging.getLogger(__name__)
 OTHER_PAPER, OTHER_PAPER_SIGMAS = 0.02, 4.0  # of the log of the sides' ratio: A4 and letter differ by 0.09
 THICKNESS_SIGMA = 0.1  # mm: office paper has 0.1, photo paper 0.25, and the object may stand on the sheet
 ROBUST_NOISES = 3.0  # sigmas of the bundle's corner noise, from which a corner of one of several views counts less
@@ -231,6 +233,9 @@ def _above(
     centre = board.points().mean(0)
     away = float(np.linalg.norm(ground.world_from_camera.translation - centre))
     optics, share = optics_of(read_exif(tripod.path)), marker_share(tripod.grey, tripod.corners)
+    doubts = scale_doubts(board, away, tripod.path.name, optics, share)
+    for doubt in doubts:  # now, since lights are long looked for at a wrong scale
+        LOG.warning(doubt)
     residuals = {
         "board": board.spec(),
         "scale": scale_of(board, is_named),
@@ -243,10 +248,7 @@ def _above(
         "pose_covariance": ground.covariance.tolist(),
         "sheet_waves_mm": fit.waves_mm(),
         "notes": [*notes, *_partly_seen(tripod.corners), *fit.notes],
-        "warnings": [
-            *_warnings(tripod.path, board, is_named),
-            *scale_doubts(board, away, tripod.path.name, optics, share),
-        ],
+        "warnings": [*_warnings(tripod.path, board, is_named), *doubts],
     }
     return BoardFit(PosedCamera(fit.camera, ground.world_from_camera, 0.0), fit, residuals)
 

@@ -147,7 +147,7 @@ def _read(source: Source, options: RunOptions, run: RunFolder) -> tuple[Photos, 
 
 def _calibrated(source: Source, photos: Sequence[Photos], options: RunOptions, run: RunFolder) -> CalibratedViews:
     """Stage "calibrate"; small photos are named anew if the first view is left out."""
-    with log_to("calibration", run.activity):
+    with log_to("calibration", run.activity, lambda text: run.progress(message=text)):
         calibrated = calibrate_source(source, photos, options)
     if len(photos) > 1 and photos[0].view != calibrated.views[0].name:
         write_thumbnails(source, run, calibrated.views[0].name)

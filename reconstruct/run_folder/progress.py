@@ -25,23 +25,25 @@ def progress(stage: str, show: Callable[[Progress], object]) -> OnProgress:
 class _Told(logging.Handler):
     """Hands on what one thread logs."""
 
-    def __init__(self, say: Callable[[str], None]):
+    def __init__(self, say: Callable[[str], None], warn: Callable[[str], None]):
         super().__init__(logging.INFO)
-        self._say, self._thread = say, threading.get_ident()
+        self._say, self._warn, self._thread = say, warn, threading.get_ident()
 
     def emit(self, record: logging.LogRecord) -> None:
         if record.thread == self._thread:
-            self._say(record.getMessage())
+            say = self._warn if record.levelno >= logging.WARNING else self._say
+            say(record.getMessage())
 
 
 @contextmanager
-def log_to(package: str, say: Callable[[str], None]) -> Iterator[None]:
+def log_to(package: str, say: Callable[[str], None], warn: Callable[[str], None]) -> Iterator[None]:
     """Say what a package logs of its steps, as long as this lasts; of this thread alone, as runs may be side by side.
 
     Args:
         package: name of its logger.
+        warn: gets what it warns of; `say` gets the rest.
     """
-    logger, handler = logging.getLogger(package), _Told(say)
+    logger, handler = logging.getLogger(package), _Told(say, warn)
     if logger.getEffectiveLevel() > logging.INFO:
         logger.setLevel(logging.INFO)
     logger.addHandler(handler)
