@@ -48,7 +48,6 @@ START_BEAMS = (2.0, 6.0)  # a bare LED to a focused one
 START_AMBIENT = 0.02  # of a flashlight at a hand's usual distance: a dark room
 FEW_CELLS = 400  # of a first fit: light is smooth over the ground
 ROUNDS = 5  # of finding directions and the ground's albedo in turn: it settles in three
-MOST_ALBEDO = 0.9  # of white paint
 BLOCKS = 4  # along each side of the ground: regions over which errors are told to be alike
 GLOSS_ANGLE = np.radians(22.0)  # half angle below which a glossy table mirrors the light
 GLOSS_RISE = 0.03
@@ -170,7 +169,7 @@ def first_fits(evidence: Evidence) -> FirstFits:
     for beam in START_BEAMS:
         for distance in hand.DISTANCES[1:-1]:
             state, weight = refine(_on_sphere(thin, distance, beam), thin, ALIKE_POWER, free_tangent, FAR[:8])
-            starts.append((cost(state, thin, weight, ALIKE_POWER), len(starts), with_wall(state, thin, weight)))
+            starts.append((cost(state, thin, weight, ALIKE_POWER), len(starts), state))
     better = sorted(starts)[: len(starts) // 2]  # what is far behind by now does not catch up
     found = [refine(state, thin, ALIKE_POWER, free_tangent, FAR[8:] + NEAR) for _, _, state in better]
     costs = np.array([cost(state, thin, weight, ALIKE_POWER) for state, weight in found])
@@ -213,26 +212,6 @@ def _on_sphere(evidence: Evidence, distance: float, beam: float) -> Flashlights:
         power = np.array([offset[k] for (_, offset), k in zip(best, index, strict=True)])
         shown = table[index] + power[:, None]
     return state(places[index])
-
-
-def with_wall(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> Flashlights:
-    """Return the state with the wall, of several places, that explains most of its residuals; as it is where none does.
-
-    The residuals' least-squares answer to each wall's light gives its albedo.
-    """
-    residual, total = cell_residuals(flashlights, evidence, weight), np.exp(log_irradiance(flashlights, evidence))
-    best, gain = flashlights, 0.0
-    for azimuth in np.arange(8) * np.pi / 4:
-        for distance in hand.DISTANCES[:5:2]:
-            wall = np.array([azimuth, np.log(distance), 1.0])
-            share = log_irradiance(replace(flashlights, wall=wall), evidence)
-            sent = 1 - total / np.exp(share)
-            sent -= (weight * sent).sum(0) / np.maximum(weight.sum(0), 1e-12)
-            pull, size = float((weight * residual * sent).sum()), float((weight * sent**2).sum())
-            if pull > 0 and pull**2 / max(size, 1e-12) > gain:
-                gain = pull**2 / max(size, 1e-12)
-                best = replace(flashlights, wall=np.array([azimuth, np.log(distance), min(pull / size, MOST_ALBEDO)]))
-    return best
 
 
 def design_effect(residual: Samples, weight: Samples, evidence: Evidence) -> float:
