@@ -19,7 +19,7 @@ from calibration.flashlight.model import (
     normal_equations,
     pulled,
 )
-from capture.checks.robust import spread
+from capture.checks.robust import cauchy, spread
 
 TRIES = 6  # dampings, each four times the last, until a step lowers the cost
 SETTLED = 1e-6  # of the cost: a step that promises less is not taken
@@ -39,7 +39,7 @@ class RobustWeights:
         known = evidence.weight > 0
         sigma = max(spread(residual[known]), self.narrowest)
         x = residual / (self.cut * sigma)
-        vote = np.where(np.abs(x) < 1, (1 - x**2) ** 2, 0.0) if self.forgets else 1 / (1 + x**2)
+        vote = np.where(np.abs(x) < 1, (1 - x**2) ** 2, 0.0) if self.forgets else cauchy(x**2)
         return evidence.weight * vote
 
 

@@ -9,9 +9,10 @@ and c_k its colour (two log ratios of channels):
 
 Log odds of object over ground are summed over photos and divided by how many photos one independent photo is worth,
 which the spread of the sums on ground tells. The look is added: a histogram of albedo and colour for ground, learned
-away from the object, and of colour alone for the object, whose brightness changes with its normal. A minimum cut joins
-the pixels [Boykov and Jolly 2001]; it is cheap where neighbours differ in most photos: an outline, no shadow's edge.
-Look and cut are fitted in turn [Rother, Kolmogorov and Blake 2004].
+away from the object, and of colour alone for the object, whose brightness changes with its normal; and what another
+outline says, if there is one [Dawid and Skene 1979]. A minimum cut joins the pixels [Boykov and Jolly 2001]; it is
+cheap where neighbours differ in most photos: an outline, no shadow's edge. Look and cut are fitted in turn [Rother,
+Kolmogorov and Blake 2004].
 """
 
 from dataclasses import dataclass
@@ -112,9 +113,9 @@ def witness_odds(witness: Witness, region: Region) -> Map:
     Both rates are counted against the region [Dawid and Skene 1979]. Ground in a gap is called an object as often as
     the geometric mean of the two says, so that half of this counts there.
     """
-    hits, alarms = (((witness > 0) & of).sum(dtype=float) + 1 for of in (region, ~region))
-    hits, alarms = hits / (((witness != 0) & region).sum() + 2), alarms / (((witness != 0) & ~region).sum() + 2)
-    return (witness != 0) * np.where(witness > 0, np.log(hits / alarms), np.log((1 - hits) / (1 - alarms)))
+    speaks, calls = witness != 0, witness > 0
+    hits, alarms = (((calls & of).sum() + 1) / ((speaks & of).sum() + 2) for of in (region, ~region))
+    return speaks * np.where(calls, np.log(hits / alarms), np.log((1 - hits) / (1 - alarms)))
 
 
 def _worth(single: Maps, lit: Bool[np.ndarray, "photos height width"]) -> float:

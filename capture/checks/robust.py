@@ -1,4 +1,4 @@
-"""Standard deviations, quantiles and least squares that a few wrong values do not change."""
+"""Standard deviations, quantiles and weights that a few wrong values do not change."""
 
 import numpy as np
 from jaxtyping import Float
