@@ -165,12 +165,13 @@ const KEYS = /^(Arrow\w+|[-+=?lL0-9])$/; // of the stage
 
 /** While a button of this page has the focus, the stage's keys go to the results all the same. */
 addEventListener("keydown", (event) => {
-  const isTaken = event.defaultPrevented || event.altKey || event.ctrlKey || event.metaKey || event.target.closest("input, select, textarea, dialog");
+  const isBrowsers = event.altKey || event.metaKey || (event.ctrlKey && !event.key.startsWith("Arrow"));
+  const isTaken = event.defaultPrevented || isBrowsers || event.target.closest("input, select, textarea, dialog");
   const frames = document.querySelectorAll("iframe.result");
   if (isTaken || !frames.length || !KEYS.test(event.key)) return;
   event.preventDefault();
   if (event.key === "?") frames[0].focus(); // Escape then closes the list of keys
-  for (const one of frames) one.contentWindow.postMessage({ press: { key: event.key, shiftKey: event.shiftKey } }, "*");
+  for (const one of frames) one.contentWindow.postMessage({ press: { key: event.key, shiftKey: event.shiftKey, ctrlKey: event.ctrlKey } }, "*");
 });
 
 export function compare(names, again) {
