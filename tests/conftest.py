@@ -86,7 +86,13 @@ def pytest_runtest_setup() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest files come first: otherwise one process works on one of them when the others have nothing left."""
+    """The longest files come first: otherwise one process works on one of them when the others have nothing left.
+
+    A test with a browser is tried again once, and the summary counts it: its other processes have no time of their own.
+    """
+    for item in items:
+        if item.get_closest_marker("browser"):
+            item.add_marker(pytest.mark.flaky(reruns=1))
     place = {stem: at for at, stem in enumerate(LONGEST_FIRST)}
     items.sort(key=lambda item: place.get(item.path.stem, len(place)))
 
