@@ -104,14 +104,18 @@ NAME = """() => { const one = document.activeElement;
 
 
 def press_until(tab, words: str, frame=None) -> None:
-    """Tab on until the element of this name has the focus; each on the way shows that it has it."""
-    frame, passed = frame or tab, []
+    """Tab on until the element of this name has the focus; each on the way shows that it has it.
+
+    A page has handled a key when `press` returns; a frame, which is a process of its own, handles it when it has time.
+    """
+    place, passed = frame or tab, []
     for _ in range(60):
-        frame.evaluate("window.had = document.activeElement")
+        place.evaluate("window.had = document.activeElement")
         tab.keyboard.press("Tab")
-        wait_until(tab, lambda: frame.evaluate("document.activeElement !== window.had"))
-        passed.append(frame.evaluate(NAME))
-        assert frame.evaluate(SEEN), f"nobody sees that {passed[-1]} has the focus"
+        if frame:
+            wait_until(tab, lambda: frame.evaluate("document.activeElement !== window.had"))
+        passed.append(place.evaluate(NAME))
+        assert place.evaluate(SEEN), f"nobody sees that {passed[-1]} has the focus"
         if words in passed[-1]:
             return
     raise AssertionError(f"{words} cannot be reached by the keyboard, only {passed}")
