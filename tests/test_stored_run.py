@@ -195,7 +195,7 @@ def changed(run: Path, name: str, **rest: object) -> None:
         ({"sdf": 100 * torch.randn(8, 8, 8)}, "neighbouring nodes differs by"),
         ({"sdf": torch.randn(48, 48, 48, generator=torch.Generator().manual_seed(0))}, "it is noise"),
         ({"sdf": torch.zeros(1, 4, 4)}, "nodes was found"),
-        ({"sdf": torch.zeros(4, 4)}, "'sdf' is F32"),
+        ({"sdf": torch.zeros(4, 4)}, "'sdf' is torch.float32"),
         ({"albedo": torch.zeros(2, 2, 3).half()}, "pixels of albedo"),
         ({"albedo": torch.full((48, 64, 3), float("nan")).half()}, "'albedo' has values"),
         ({"world_from_camera": torch.diag(torch.tensor([2.0, 1, 1, 1])).double()}, "no rotation"),
