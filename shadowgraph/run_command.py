@@ -134,7 +134,8 @@ def run_stages(command: Calibrate, console: Console) -> None:
                 source = open_source(command.capture, options)
                 with _loading():
                     from reconstruct.run import pipeline  # after the refusals, which need none of what it imports
-                pipeline.refuse_device(options)
+                    from reconstruct.solve.backend import solver_device
+                solver_device(options.device)  # refuses one that is not there before anything is read or written
             with RunFolder(out, display, display.activity) as run:
                 pipeline.claim(source, options, run, stages, command.force)
                 until_closed.enter_context(page(out, mode, console))
