@@ -78,7 +78,7 @@ class Relight(Command):
 
 def relight(command: Relight, console: Console) -> None:
     """Make the picture or video that was asked for, and say what is in it."""
-    from reconstruct.export.relit import NewLight, read_relit, relit_file, write_relit
+    from reconstruct.export.relit import NewLight, read, relit_file, write_relit
 
     refuse_no_run(command.run)
     new = NewLight(
@@ -93,7 +93,7 @@ def relight(command: Relight, console: Console) -> None:
     file = relit_file(command.run, new, command.out)
     with _shown("relight", console) as on_progress:
         write = lambda run, draft: write_relit(run, draft, new, command.width, on_progress)  # noqa: E731
-        print_lines(console, save(command.run, file, write, read_relit).sentence())
+        print_lines(console, save(command.run, file, write, read).sentence())
 
 
 def export(command: Export, console: Console) -> None:

@@ -69,8 +69,8 @@ class ReconstructResearch(CalibrateResearch):
 
 
 @dataclass(frozen=True)
-class Calibrate(Command):
-    """Find camera, ground and flashlight positions; writes calibration.json."""
+class OfCapture(Command):
+    """What every command takes that looks at a capture."""
 
     capture: CaptureFolder
     """Folder with board/, photos/ and optionally light/, dark/, side/; a flat folder of photos; or one with a clip."""
@@ -84,24 +84,21 @@ class Calibrate(Command):
     """auto, shading (from the ground's shading), phone (from the flashlight phone's own photos), or a file: ours
     (calibration.json, lights.json), RTI's .lp, .csv or .dome, or a file of a ShadowNeuS or S3-NeRF scene. A file
     with the light of every photo needs no board; nor do photos in which a shiny ball shows the lights."""
+
+
+@dataclass(frozen=True)
+class Check(OfCapture):
+    """Say within a minute whether a capture is good and what to shoot next; writes check.html."""
+
+
+@dataclass(frozen=True)
+class Calibrate(OfCapture):
+    """Find camera, ground and flashlight positions; writes calibration.json."""
+
     force: Flag = False
     """Start again in a folder that holds a run with other settings."""
     research: OmitArgPrefixes[CalibrateResearch] = field(default_factory=CalibrateResearch)
     """Scenes of other programs, and comparisons."""
-
-
-@dataclass(frozen=True)
-class Check(Command):
-    """Say within a minute whether a capture is good and what to shoot next; writes check.html."""
-
-    capture: CaptureFolder
-    """Folder with board/, photos/ and optionally light/, dark/, side/; a flat folder of photos; or one with a clip."""
-    out: Given[Path] = None
-    """Folder for check.html and check.json; runs/NAME unless given."""
-    board: Given[str] = None
-    """The printed board, as for `run`."""
-    lights: str = "auto"
-    """Where the lights come from, as for `run`."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from tyro.conf import Positional, arg
 from capture.errors import CaptureError
 from capture.files.names import in_one_line
 from reconstruct.run_folder.folder import RunFolder
-from shadowgraph.options import Calibrate, Check, Command, Given, Preset, Run, settings_of
+from shadowgraph.options import Calibrate, Check, Command, Given, OfCapture, Preset, Run, settings_of
 from shadowgraph.terminal import Display, page, print_lines
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def folder_name(folder: Path) -> str:
     return Path(os.path.abspath(folder)).name
 
 
-def results_folder(command: Calibrate | Check) -> Path:
+def results_folder(command: OfCapture) -> Path:
     """Return the folder for the results."""
     return command.out or Path("runs") / folder_name(command.capture)
 
