@@ -163,7 +163,7 @@ class SolvedScene:
 
     @cached_property
     def _each_view(self) -> "tuple[SolvedScene, ...]":
-        found = [replace(self, further=())]
+        found: list[SolvedScene] = [replace(self, further=())]
         grids: dict[bytes, SdfGrid] = {}
         for one in self.further:
             own = self.of_cameras(one)
