@@ -1,8 +1,8 @@
-"""KnownScene: a scene with given camera and lights, the result of every importer; and the importers' interface."""
+"""KnownScene: a scene with given camera and lights, the result of every importer; and what an importer is."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 from calibration.calibration import Calibration
 from capture.photos.finding import Finding
@@ -37,23 +37,17 @@ class KnownScene:
         return replace(self.calibration, residuals=residuals | {key: rows for key, rows in said.items() if rows})
 
 
-@runtime_checkable
-class Importer(Protocol):
-    """A reader of one layout of folders."""
+@dataclass(frozen=True)
+class Importer:
+    """A reader of one layout of folders.
 
-    @property
-    def layout(self) -> str:
-        """The layout's name, for messages."""
-        ...
+    `load` takes the folder, and which of several lists of photos to read, where a layout has them.
 
-    def recognises(self, folder: Path) -> str | None:
-        """Return why the folder looks like this layout (the matching files); None if it does not. Reads names only."""
-        ...
+    Raises:
+        CalibrationError, CaptureError: by `load`: a file or field is missing or impossible; the message names both.
+    """
 
-    def load(self, folder: Path, split: str) -> KnownScene:
-        """The scene; `split` chooses one of several lists of photos, where a layout has them.
-
-        Raises:
-            CalibrationError, CaptureError: a file or field is missing or impossible; the message names both.
-        """
-        ...
+    layout: str  # its name, for messages
+    recognises: Callable[[Path], str | None]  # why a folder looks like it (the matching files), if it does; reads names
+    load: Callable[[Path, str], KnownScene]
+    gives_way: bool = False  # to any other layout that a folder looks like

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -37,14 +37,14 @@ STEEPEST = 8.0  # voxels between neighbouring nodes: a distance has 1, one that 
 MOST_SHEETS = 12  # along an axis of the grid, on average; the kernels follow six minima per ray
 BRIGHTEST = 65504.0  # of albedo, lobes and counts of rays: the largest float16
 LAYOUTS = {
-    "sdf": Layout("F32", (None, None, None)),
-    "origin": Layout("F32", (3,)),
-    "albedo": Layout("F16", (None, None, 3)),
-    "world_from_camera": Layout("F64", (4, 4)),
-    "lights": Layout("F32", (None, 4), is_needed=False),
-    "evidence": Layout("F16", (None, None, None), is_needed=False),
-    "lobes": Layout("F32", (None, LOBES, 3), is_needed=False),
-    "lobe_weights": Layout("F16", (None, None, None), is_needed=False),
+    "sdf": Layout(torch.float32, (None, None, None)),
+    "origin": Layout(torch.float32, (3,)),
+    "albedo": Layout(torch.float16, (None, None, 3)),
+    "world_from_camera": Layout(torch.float64, (4, 4)),
+    "lights": Layout(torch.float32, (None, 4), is_needed=False),
+    "evidence": Layout(torch.float16, (None, None, None), is_needed=False),
+    "lobes": Layout(torch.float32, (None, LOBES, 3), is_needed=False),
+    "lobe_weights": Layout(torch.float16, (None, None, None), is_needed=False),
 }
 OF_A_VIEW = ("albedo", "world_from_camera", "lights", "lobe_weights")  # of a further camera: with its number, albedo_1
 OF_A_LIE = "object_from_world"  # of a further camera in another lie, with its number
@@ -89,6 +89,32 @@ class FurtherView:
     lights: Float[Tensor, "photos 4"] | None = None
     gloss_weights: Float[Tensor, "height width materials"] | None = None  # of the lobes of SolvedScene.gloss
     object_from_world: Pose | None = None  # of another lie: pose and lights are in its own world, see SolvedScene.views
+
+    def scaled(self, factor: float) -> "FurtherView":
+        """Return the same view in a unit of which `factor` are one of this one's."""
+        lights, motion = self.lights, self.object_from_world
+        if lights is not None:
+            is_point = lights[:, 3:] > 0
+            lights = torch.cat([torch.where(is_point, factor * lights[:, :3], lights[:, :3]), lights[:, 3:]], 1)
+        pose = Pose(self.world_from_camera.rotation, factor * self.world_from_camera.translation)
+        motion = None if motion is None else Pose(motion.rotation, factor * motion.translation)
+        return replace(self, world_from_camera=pose, lights=lights, object_from_world=motion)
+
+    def as_stored(self) -> "FurtherView":
+        """Round to the precision of the file."""
+        weights = None if self.gloss_weights is None else _half(self.gloss_weights).float()
+        return replace(self, albedo=_half(self.albedo).float(), gloss_weights=weights)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tensors of the file, by the names that those of the first camera have."""
+        found = {
+            "albedo": _half(self.albedo),
+            "world_from_camera": torch.from_numpy(self.world_from_camera.matrix()),
+            "lights": self.lights,
+            "lobe_weights": None if self.gloss_weights is None else _half(self.gloss_weights),
+            OF_A_LIE: None if self.object_from_world is None else torch.from_numpy(self.object_from_world.matrix()),
+        }
+        return {name: tensor.contiguous() for name, tensor in found.items() if tensor is not None}
 
 
 @dataclass(frozen=True)
@@ -137,28 +163,45 @@ class SolvedScene:
 
     @cached_property
     def _each_view(self) -> "tuple[SolvedScene, ...]":
-        found = [replace(self, further=())]
+        found: list[SolvedScene] = [replace(self, further=())]
         grids: dict[bytes, SdfGrid] = {}
         for one in self.further:
-            gloss = None
-            if self.gloss is not None and one.gloss_weights is not None:
-                gloss = replace(self.gloss, weights=one.gloss_weights)
-            own = {"albedo": one.albedo, "camera": one.camera, "world_from_camera": one.world_from_camera}
+            own = self.of_cameras(one)
             if one.object_from_world is not None:
                 key = one.object_from_world.matrix().tobytes()
                 if key not in grids:
                     grids[key] = carried(self.grid, one.object_from_world.inverse())
-                own |= {"grid": grids[key], "object_from_world": one.object_from_world, "evidence": None}
-            found.append(replace(found[0], **own, lights=one.lights, gloss=gloss, view=one.name))
+                own = replace(own, grid=grids[key], evidence=None)
+            found.append(own)
         return tuple(found)
+
+    @property
+    def cameras(self) -> tuple[FurtherView, ...]:
+        """What each camera saw, the first one's at first."""
+        weights = None if self.gloss is None else self.gloss.weights
+        pose, motion = self.world_from_camera, self.object_from_world
+        return (FurtherView(self.view, self.albedo, self.camera, pose, self.lights, weights, motion), *self.further)
+
+    def of_cameras(self, first: FurtherView, *further: FurtherView) -> "SolvedScene":
+        """Return the scene as these cameras saw it."""
+        weights = first.gloss_weights
+        return replace(
+            self,
+            albedo=first.albedo,
+            camera=first.camera,
+            world_from_camera=first.world_from_camera,
+            lights=first.lights,
+            gloss=None if self.gloss is None or weights is None else replace(self.gloss, weights=weights),
+            view=first.name,
+            further=further,
+            object_from_world=first.object_from_world,
+        )
 
     def scaled(self, factor: float, unit: str) -> "SolvedScene":
         """Return the same scene in another unit, of which `factor` are one of this one's."""
         grid = SdfGrid(factor * self.grid.values, factor * self.grid.origin, factor * self.grid.spacing)
-        further = tuple(replace(one, **_scaled_view(one, factor)) for one in self.further)
-        height = factor * self.ground_height
-        own = _scaled_view(self, factor)
-        return replace(self, grid=grid, ground_height=height, unit=unit, further=further, **own)
+        seen = self.of_cameras(*(one.scaled(factor) for one in self.cameras))
+        return replace(seen, grid=grid, ground_height=factor * self.ground_height, unit=unit)
 
     def __repr__(self) -> str:
         nodes = " x ".join(map(str, self.grid.values.shape))
@@ -166,34 +209,10 @@ class SolvedScene:
         return f"SolvedScene({nodes} nodes of {self.grid.spacing:.3g} {self.unit}, {surface})"
 
 
-def _scaled_view(view: SolvedScene | FurtherView, factor: float) -> dict[str, Any]:
-    """Return the pose and the lights of a camera in another unit."""
-    lights = view.lights
-    if lights is not None:
-        is_point = lights[:, 3:] > 0
-        lights = torch.cat([torch.where(is_point, factor * lights[:, :3], lights[:, :3]), lights[:, 3:]], 1)
-    pose = Pose(view.world_from_camera.rotation, factor * view.world_from_camera.translation)
-    motion = view.object_from_world
-    if motion is not None:
-        motion = Pose(motion.rotation, factor * motion.translation)
-    return {"world_from_camera": pose, "lights": lights, "object_from_world": motion}
-
-
 def as_stored(fields: SolvedScene) -> SolvedScene:
     """Round the fields to the precision of their file, so that a solved scene equals its file."""
-    gloss = fields.gloss
-    return replace(
-        fields,
-        albedo=_half(fields.albedo).float(),
-        gloss=None if gloss is None else replace(gloss, weights=_half(gloss.weights).float()),
-        evidence=None if fields.evidence is None else _half(fields.evidence).float(),
-        further=tuple(_view_as_stored(one) for one in fields.further),
-    )
-
-
-def _view_as_stored(one: FurtherView) -> FurtherView:
-    weights = None if one.gloss_weights is None else _half(one.gloss_weights).float()
-    return replace(one, albedo=_half(one.albedo).float(), gloss_weights=weights)
+    seen = fields.of_cameras(*(one.as_stored() for one in fields.cameras))
+    return replace(seen, evidence=None if fields.evidence is None else _half(fields.evidence).float())
 
 
 def _half(values: Tensor) -> Tensor:
@@ -203,20 +222,13 @@ def _half(values: Tensor) -> Tensor:
 
 def save_fields(fields: SolvedScene, path: Path) -> None:
     """Write SolvedScene as safetensors, with the rest as JSON in the header; whole or not at all."""
-    tensors = {
-        "sdf": fields.grid.values.contiguous(),
-        "origin": fields.grid.origin.contiguous(),
-        "albedo": _half(fields.albedo).contiguous(),
-        "world_from_camera": torch.from_numpy(fields.world_from_camera.matrix()),
-    }
-    if fields.lights is not None:
-        tensors["lights"] = fields.lights.contiguous()
+    tensors = {"sdf": fields.grid.values.contiguous(), "origin": fields.grid.origin.contiguous()}
     if fields.evidence is not None:
         tensors["evidence"] = _half(fields.evidence).contiguous()
     if fields.gloss is not None:
-        tensors |= {"lobes": fields.gloss.lobes.contiguous(), "lobe_weights": _half(fields.gloss.weights).contiguous()}
-    for number, one in enumerate(fields.further, 1):
-        tensors |= {f"{name}_{number}": tensor for name, tensor in _further_tensors(one).items()}
+        tensors["lobes"] = fields.gloss.lobes.contiguous()
+    for number, one in enumerate(fields.cameras):
+        tensors |= {f"{name}_{number}" if number else name: tensor for name, tensor in one.tensors().items()}
     rest = {
         "spacing": fields.grid.spacing,
         "camera": asdict(fields.camera),
@@ -232,21 +244,6 @@ def save_fields(fields: SolvedScene, path: Path) -> None:
         rest |= {"view": fields.view, "further": views}
     with atomic_file(path) as temporary:
         write_tensors(tensors, {"format": FORMAT, "fields": json.dumps(rest)}, temporary)
-
-
-def _further_tensors(view: FurtherView) -> dict[str, Tensor]:
-    """Return the tensors of a further camera in the file, by the names that the first camera's have."""
-    found = {
-        "albedo": _half(view.albedo).contiguous(),
-        "world_from_camera": torch.from_numpy(view.world_from_camera.matrix()),
-    }
-    if view.lights is not None:
-        found["lights"] = view.lights.contiguous()
-    if view.object_from_world is not None:
-        found["object_from_world"] = torch.from_numpy(view.object_from_world.matrix())
-    if view.gloss_weights is not None:
-        found["lobe_weights"] = _half(view.gloss_weights).contiguous()
-    return found
 
 
 class _ViewHeader(Struct, kw_only=True):

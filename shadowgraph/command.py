@@ -13,7 +13,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, NamedTuple
@@ -23,11 +22,11 @@ from rich.console import Console
 
 from capture.errors import FOR_STUDIO, Remedy, UserError
 from capture.files.names import in_one_line, refuse_no_folder
-from shadowgraph.export_command import Export, Relight, do_export, do_relight
+from shadowgraph.export_command import Export, Relight, export, relight
 from shadowgraph.options import Calibrate, Check, Doctor, Evaluate, Import, PrintBoard, Reconstruct, Report, Run, View
-from shadowgraph.run_command import Batch, check, do_batch, folder_name, run_stages
-from shadowgraph.studio_command import Studio, Watch, do_studio, do_watch
-from shadowgraph.terminal import Display, print_lines
+from shadowgraph.run_command import Batch, batch, check, folder_name, run_stages
+from shadowgraph.studio_command import Studio, Watch, studio, watch
+from shadowgraph.terminal import print_lines
 from viewer.studio.words import in_page_words
 
 OPTIONS = {
@@ -41,7 +40,6 @@ OPTIONS = {
     Remedy.OTHER_FOLDER: "--out",
     Remedy.PACK_FAULT: "--debug shows more",
 }
-SOME_FAILED = 1  # exit code of a batch that ended with failed captures
 
 
 class Terminated(KeyboardInterrupt):
@@ -106,11 +104,6 @@ def sentence_for(error: Exception) -> str | None:
     return None
 
 
-def _batch(command: Batch, console: Console) -> None:
-    if not do_batch(command, partial(print_lines, console)):
-        raise SystemExit(SOME_FAILED)
-
-
 def _view(command: View, console: Console) -> None:
     import webbrowser
 
@@ -118,18 +111,6 @@ def _view(command: View, console: Console) -> None:
 
     opens = webbrowser.open if console.is_terminal and not command.no_open else None
     view(command.run, command.host, command.port, opens=opens)
-
-
-def _export(command: Export, console: Console) -> None:
-    display = Display(console)
-    with display.progress:
-        do_export(command, partial(print_lines, console), display)
-
-
-def _relight(command: Relight, console: Console) -> None:
-    display = Display(console)
-    with display.progress:
-        do_relight(command, partial(print_lines, console), display)
 
 
 def _import(command: Import, console: Console) -> None:
@@ -203,15 +184,15 @@ class Subcommand(NamedTuple):
 
 SUBCOMMANDS = (  # in the order of --help
     Subcommand("run", Run, run_stages),
-    Subcommand("batch", Batch, _batch),
+    Subcommand("batch", Batch, batch),
     Subcommand("check", Check, check),
     Subcommand("calibrate", Calibrate, run_stages),
     Subcommand("reconstruct", Reconstruct, run_stages),
-    Subcommand("studio", Studio, do_studio),
-    Subcommand("watch", Watch, do_watch),
+    Subcommand("studio", Studio, studio),
+    Subcommand("watch", Watch, watch),
     Subcommand("view", View, _view),
-    Subcommand("export", Export, _export),
-    Subcommand("relight", Relight, _relight),
+    Subcommand("export", Export, export),
+    Subcommand("relight", Relight, relight),
     Subcommand("import", Import, _import),
     Subcommand("evaluate", Evaluate, _evaluate),
     Subcommand("report", Report, _report),

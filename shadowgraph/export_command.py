@@ -1,31 +1,33 @@
 """The commands `export` and `relight`: their options and the functions that do them."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from rich.console import Console
 from tyro.conf import Positional, arg
 
 from capture.errors import CaptureError
-from reconstruct.export.export import ExportOptions, export, format_for, save
+from reconstruct.export.export import ExportOptions, OnProgress, format_for, save
+from reconstruct.export.export import export as export_run
 from reconstruct.export.formats import DATASETS
-from reconstruct.run_folder.folder import Progress
 from reconstruct.run_folder.progress import progress
 from reconstruct.stored_run.refusal import refuse_no_run
-from shadowgraph.options import Flag, Given
+from shadowgraph.options import Command, Given, ResultFolder
+from shadowgraph.terminal import Display, print_lines
 from viewer.report.formats import FORMATS
 
-RunFolder = Annotated[Positional[Path], arg(metavar="RUN")]
 FORMAT_NAMES = ", ".join(FORMATS)
 
 
 @dataclass(frozen=True)
-class Export:
+class Export(Command):
     """Save a finished run as something else: meshes, pictures, videos, a page to send to somebody."""
 
-    run: RunFolder
+    run: ResultFolder
     """The folder of a finished run."""
     file: Annotated[Positional[Path | None], arg(metavar="FILE", help_behavior_hint="")] = None
     """The file to write; RUN/exports/... unless given. Its ending chooses the format unless --format does."""
@@ -46,15 +48,13 @@ class Export:
     photos: Given[Path] = None
     """For shadowneus, rti, colmap and nerf: the capture's folder, to export its photos. Without it, computed
     pictures are exported. A FILE without an ending is a folder, else a .zip."""
-    debug: Flag = False
-    """Show the traceback of an error."""
 
 
 @dataclass(frozen=True)
-class Relight:
+class Relight(Command):
     """Make a picture under a light that was not there, or a video of a light that goes around the object."""
 
-    run: RunFolder
+    run: ResultFolder
     """The folder of a finished run."""
     light: Annotated[Given[str], arg(metavar="X,Y,Z")] = None
     """Place of a lamp in the world of the run, mm (or units of the scene), z up."""
@@ -74,13 +74,11 @@ class Relight:
     """Radius of the lamp, mm (or units of the scene); a larger lamp casts softer shadows."""
     brightness: float = 1.0
     """Factor on the capture's flashlight, or on the map, which is exposed for white paper on open ground."""
-    debug: Flag = False
-    """Show the traceback of an error."""
 
 
-def do_relight(command: Relight, say: Callable[[str], object], show: Callable[[Progress], object]) -> None:
+def relight(command: Relight, console: Console) -> None:
     """Make the picture or video that was asked for, and say what is in it."""
-    from reconstruct.export.relit import NewLight, read_relit, relit_file, write_relit
+    from reconstruct.export.relit import NewLight, read, relit_file, write_relit
 
     refuse_no_run(command.run)
     new = NewLight(
@@ -92,27 +90,34 @@ def do_relight(command: Relight, say: Callable[[str], object], show: Callable[[P
         command.lamp_size,
         command.brightness,
     )
-    on_progress = progress("relight", show)
     file = relit_file(command.run, new, command.out)
-    say(
-        save(
-            command.run, file, lambda run, draft: write_relit(run, draft, new, command.width, on_progress), read_relit
-        ).sentence()
-    )
+    with _shown("relight", console) as on_progress:
+        write = lambda run, draft: write_relit(run, draft, new, command.width, on_progress)  # noqa: E731
+        print_lines(console, save(command.run, file, write, read).sentence())
 
 
-def do_export(command: Export, say: Callable[[str], object], show: Callable[[Progress], object]) -> None:
+def export(command: Export, console: Console) -> None:
     """Write the file or folder that was asked for, and say what is in it."""
     refuse_no_run(command.run)
     sizes = (command.faces, command.texture, command.width, command.frames, command.lamp_size)
     options = ExportOptions(*sizes, command.photos, command.print_size)
     name = format_for(command.file, command.format)
-    if name in DATASETS and command.file is not None and not command.file.suffix:
-        from reconstruct.export.datasets import export_folder
+    with _shown(name, console) as on_progress:
+        if name in DATASETS and command.file is not None and not command.file.suffix:
+            from reconstruct.export.datasets import export_folder
 
-        say(export_folder(command.run, name, command.file, options, progress(name, show)))
-        return
-    say(export(command.run, name, command.file, options, progress(name, show)).sentence())
+            said = export_folder(command.run, name, command.file, options, on_progress)
+        else:
+            said = export_run(command.run, name, command.file, options, on_progress).sentence()
+        print_lines(console, said)
+
+
+@contextmanager
+def _shown(stage: str, console: Console) -> Iterator[OnProgress]:
+    """Yield a callback whose steps the terminal shows as those of a stage."""
+    display = Display(console)
+    with display.progress:
+        yield progress(stage, display)
 
 
 def _three(text: str | None, option: str) -> tuple[float, float, float] | None:

@@ -24,6 +24,14 @@ Flag = Annotated[FlagCreatePairsOff[bool], UNSAID]
 
 
 @dataclass(frozen=True)
+class Command:
+    """What every command takes."""
+
+    debug: Flag = field(default=False, kw_only=True)
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
 class CalibrateResearch:
     """Scenes of other programs, and comparisons."""
 
@@ -61,8 +69,8 @@ class ReconstructResearch(CalibrateResearch):
 
 
 @dataclass(frozen=True)
-class Calibrate:
-    """Find camera, ground and flashlight positions; writes calibration.json."""
+class OfCapture(Command):
+    """What every command takes that looks at a capture."""
 
     capture: CaptureFolder
     """Folder with board/, photos/ and optionally light/, dark/, side/; a flat folder of photos; or one with a clip."""
@@ -76,28 +84,21 @@ class Calibrate:
     """auto, shading (from the ground's shading), phone (from the flashlight phone's own photos), or a file: ours
     (calibration.json, lights.json), RTI's .lp, .csv or .dome, or a file of a ShadowNeuS or S3-NeRF scene. A file
     with the light of every photo needs no board; nor do photos in which a shiny ball shows the lights."""
-    force: Flag = False
-    """Start again in a folder that holds a run with other settings."""
-    debug: Flag = False
-    """Show the traceback of an error."""
-    research: OmitArgPrefixes[CalibrateResearch] = field(default_factory=CalibrateResearch)
-    """Scenes of other programs, and comparisons."""
 
 
 @dataclass(frozen=True)
-class Check:
+class Check(OfCapture):
     """Say within a minute whether a capture is good and what to shoot next; writes check.html."""
 
-    capture: CaptureFolder
-    """Folder with board/, photos/ and optionally light/, dark/, side/; a flat folder of photos; or one with a clip."""
-    out: Given[Path] = None
-    """Folder for check.html and check.json; runs/NAME unless given."""
-    board: Given[str] = None
-    """The printed board, as for `run`."""
-    lights: str = "auto"
-    """Where the lights come from, as for `run`."""
-    debug: Flag = False
-    """Show the traceback of an error."""
+
+@dataclass(frozen=True)
+class Calibrate(OfCapture):
+    """Find camera, ground and flashlight positions; writes calibration.json."""
+
+    force: Flag = False
+    """Start again in a folder that holds a run with other settings."""
+    research: OmitArgPrefixes[CalibrateResearch] = field(default_factory=CalibrateResearch)
+    """Scenes of other programs, and comparisons."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ class Run(Reconstruct):
 
 
 @dataclass(frozen=True)
-class View:
+class View(Command):
     """Open a run in the browser: follow it while it goes on; light, turn, measure and save it once it is finished."""
 
     run: ResultFolder
@@ -140,12 +141,10 @@ class View:
     """The next free one is taken where this one is busy."""
     no_open: Flag = False
     """Do not open the browser, which a terminal otherwise does; print the address only."""
-    debug: Flag = False
-    """Show the traceback of an error."""
 
 
 @dataclass(frozen=True)
-class Import:
+class Import(Command):
     """Write another program's scene (ShadowNeuS, DeepShadow, S3-NeRF, RTI, DiLiGenT) in Shadowgraph's own layout.
 
     `run` reads these folders directly. This command also says what it found in one and what it assumed.
@@ -157,24 +156,20 @@ class Import:
     """A new folder for the result; imported/NAME unless given."""
     split: str = "train"
     """Which list of photos to read, where there are several: transforms_SPLIT.json, params_SPLIT.npz."""
-    debug: Flag = False
-    """Show the traceback of an error."""
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class Evaluate(Command):
     """Compare a run with a reference (a capture or scene with a gt/ folder); prints JSON."""
 
     run: ResultFolder
     """The folder of a finished run."""
     reference: Annotated[Path, arg(metavar="REFERENCE")]
     """The folder that holds the truth."""
-    debug: Flag = False
-    """Show the traceback of an error."""
 
 
 @dataclass(frozen=True)
-class Report:
+class Report(Command):
     """Write report.html of a run again, or pack the run for a bug report."""
 
     run: ResultFolder
@@ -183,12 +178,10 @@ class Report:
     """Pack log, reports, calibration, settings and versions into this .zip, without photos and personal paths."""
     with_pictures: Flag = False
     """Also pack small copies of the photos, and the pictures in the pages."""
-    debug: Flag = False
-    """Show the traceback of an error."""
 
 
 @dataclass(frozen=True)
-class PrintBoard:
+class PrintBoard(Command):
     """Make a board to print at true scale: a PDF and a PNG, with a ruler, and the line for session.toml."""
 
     out: Annotated[Positional[Path], arg(metavar="FILE")] = Path("board.pdf")
@@ -199,16 +192,11 @@ class PrintBoard:
     """The sheet."""
     board: Given[str] = None
     """Another size, as charuco:5x7:30:22:DICT_4X4_50 or checkerboard:9x6:24."""
-    debug: Flag = False
-    """Show the traceback of an error."""
 
 
 @dataclass(frozen=True)
-class Doctor:
+class Doctor(Command):
     """Say what this machine can do, and how long a run will take."""
-
-    debug: Flag = False
-    """Show the traceback of an error."""
 
 
 def settings_of(command: Calibrate) -> dict[str, Any]:

@@ -5,12 +5,12 @@ The command `batch`: many captures, one page of results.
 
 import gc
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from rich.console import Console
 from rich.text import Text
@@ -19,15 +19,18 @@ from tyro.conf import Positional, arg
 from capture.errors import CaptureError
 from capture.files.names import in_one_line
 from reconstruct.run_folder.folder import RunFolder
-from shadowgraph.options import Calibrate, Check, Flag, Given, Run, settings_of
+from shadowgraph.options import Calibrate, Check, Command, Given, OfCapture, Preset, Run, settings_of
 from shadowgraph.terminal import Display, page, print_lines
 
 if TYPE_CHECKING:
     from reconstruct.run.batch import Outcome
 
 
+SOME_FAILED = 1  # exit code of a batch that ended with failed captures
+
+
 @dataclass(frozen=True)
-class Batch:
+class Batch(Command):
     """Run many captures, each on its own, and write one page of results. The same command again continues it."""
 
     folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="FOLDER")]
@@ -40,21 +43,20 @@ class Batch:
     """Run on a Ray cluster instead, whose machines see the same folders: auto, HOST:PORT, ray://HOST:PORT, or local."""
     threads: Given[int] = None
     """Cores for each capture; all of this machine over --jobs unless given."""
-    preset: Literal["draft", "standard", "fine", "paper"] = "standard"
+    preset: Preset = "standard"
     """As for `run`."""
     board: Given[str] = None
     """The printed board of all captures, as for `run`, where they do not say it themselves."""
     seed: int = 0
     """As for `run`."""
-    debug: Flag = False
-    """Show the traceback of an error."""
 
 
-def do_batch(command: Batch, say: Callable[[str], object]) -> bool:
-    """Run every capture that is not done yet. Return whether none failed.
+def batch(command: Batch, console: Console) -> None:
+    """Run every capture that is not done yet.
 
     Raises:
         CaptureError: no capture, one given twice, or settings that make no sense.
+        SystemExit: a capture failed.
     """
     from reconstruct.run.batch import find_captures, locally, make_tasks, on_ray, run_batch
     from viewer.report.batch_page import write_batch_page, write_thumbnail
@@ -73,13 +75,14 @@ def do_batch(command: Batch, say: Callable[[str], object]) -> bool:
                 write_thumbnail(command.out / name)
             words = f"failed: {one.sentence}" if one.exit_code else f"done in {one.seconds:.0f} s"
             said.add(name)
-            say(f"{len(said)} of {len(tasks)}, {name}: {words}")
+            print_lines(console, f"{len(said)} of {len(tasks)}, {name}: {words}")
         write_batch_page(command.out, tasks, outcomes)
 
     engine = partial(on_ray, address=command.ray) if command.ray else partial(locally, jobs=command.jobs)
     outcomes = run_batch(tasks, engine, show_outcomes)
-    say(f"Results in {command.out / 'index.html'}")
-    return all(one.exit_code == 0 for one in outcomes.values())
+    print_lines(console, f"Results in {command.out / 'index.html'}")
+    if any(one.exit_code for one in outcomes.values()):
+        raise SystemExit(SOME_FAILED)
 
 
 @contextmanager
@@ -105,7 +108,7 @@ def folder_name(folder: Path) -> str:
     return Path(os.path.abspath(folder)).name
 
 
-def results_folder(command: Calibrate | Check) -> Path:
+def results_folder(command: OfCapture) -> Path:
     """Return the folder for the results."""
     return command.out or Path("runs") / folder_name(command.capture)
 
@@ -131,7 +134,8 @@ def run_stages(command: Calibrate, console: Console) -> None:
                 source = open_source(command.capture, options)
                 with _loading():
                     from reconstruct.run import pipeline  # after the refusals, which need none of what it imports
-                pipeline.refuse_device(options)
+                    from reconstruct.solve.backend import solver_device
+                solver_device(options.device)  # refuses one that is not there before anything is read or written
             with RunFolder(out, display, display.activity) as run:
                 pipeline.claim(source, options, run, stages, command.force)
                 until_closed.enter_context(page(out, mode, console))

@@ -2,17 +2,12 @@
 
 import html
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float
 
 from calibration.calibrated_views import load_views
-from calibration.calibration import Calibration
 from capture.errors import ReconstructionError
-from capture.files.title import title_of
-from reconstruct.fields import SolvedScene
 from reconstruct.stored_run.documents import lit_photos
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.display.run_follower import size_text
@@ -23,7 +18,7 @@ NEEDED = ("calibration.json", "fields.safetensors", "mesh.ply", "report.json")
 CARD_PX = (420, 315)
 
 
-class RunResult:
+class RunResult(StoredRun):
     """The results of a finished run. Each is read when it is first asked for. World frame, lengths in `unit`."""
 
     def __init__(self, path: str | Path):
@@ -32,8 +27,7 @@ class RunResult:
         Raises:
             ReconstructionError: the run is not finished, or this is no run's folder.
         """
-        self.path = Path(path)
-        self._run = StoredRun(self.path)
+        super().__init__(Path(path))
         missing = [name for name in NEEDED if not (self.path / name).is_file()]
         if missing:
             raise ReconstructionError(
@@ -42,14 +36,9 @@ class RunResult:
             )
 
     @property
-    def report(self) -> dict[str, Any]:
-        """Return report.json: what was used, assumed and left out, and what it cost."""
-        return self._run.report
-
-    @property
-    def unit(self) -> str:
-        """Return the unit of length: "mm", or "scene" where the capture gives no scale."""
-        return self.calibration.unit
+    def path(self) -> Path:
+        """Return the run's folder."""
+        return self.run_dir
 
     @property
     def warnings(self) -> list[str]:
@@ -57,33 +46,14 @@ class RunResult:
         return [str(line) for line in self.report.get("warnings", [])]
 
     @property
-    def calibration(self) -> Calibration:
-        """Return camera, ground plane and lights."""
-        return self._run.calibration
-
-    @property
-    def fields(self) -> SolvedScene:
-        """Return the signed distance field and the materials, for shadowgraph.look and shadowgraph.relight."""
-        return self._run.fields
-
-    @property
-    def mesh(self) -> trimesh.Trimesh:
-        """Return the closed surface with vertex colours; its `vertex_attributes` hold `evidence` and `sigma`.
-
-        Raises:
-            ReconstructionError: mesh.ply cannot be read.
-        """
-        return self._run.mesh
-
-    @property
     def depth(self) -> Float[np.ndarray, "height width"]:
         """Return the z-depth of the object on the photos' pixels; inf elsewhere."""
-        return self._run.maps.depth
+        return self.maps.depth
 
     @property
     def normals(self) -> Float[np.ndarray, "height width 3"]:
         """Return the outward unit normals of the object on the photos' pixels; 0 elsewhere."""
-        return self._run.maps.normals
+        return self.maps.normals
 
     @property
     def mask(self) -> Bool[np.ndarray, "height width"]:
@@ -92,7 +62,7 @@ class RunResult:
         Raises:
             UserError: mask.png cannot be read.
         """
-        return self._run.maps.mask
+        return self.maps.mask
 
     def __repr__(self) -> str:
         size = size_text(self.mesh.extents, self.unit)
@@ -112,6 +82,6 @@ class RunResult:
         return (
             '<div style="display:flex;gap:1.5em;align-items:center;flex-wrap:wrap">'
             f'<img alt="The mesh from the camera\'s side" width="{CARD_PX[0] // 2}" src="{data_uri(picture)}">'
-            f"<div><b>{html.escape(title_of(self.path))}</b>{lines}"
+            f"<div><b>{html.escape(self.name)}</b>{lines}"
             f"<code>shadowgraph view {html.escape(str(self.path))}</code></div></div>"
         )

@@ -1,20 +1,25 @@
 """The commands `studio` and `watch`: captures and runs of a folder in the browser; photos of one as they arrive."""
 
+import time
+import webbrowser
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from shadowgraph.options import Flag
+from capture.files.names import refuse_no_folder
+from shadowgraph.options import Command, Flag
+from shadowgraph.terminal import print_lines
 
 WATCH_S = 0.5  # between two looks at a folder; nothing is read that has not changed
 HOME = "Shadowgraph"  # in the user's home, where no folder is named and the present one holds no captures
 
 
 @dataclass(frozen=True)
-class Studio:
+class Studio(Command):
     """Open the studio: photos in, models out, in the browser. `shadowgraph` alone does the same."""
 
     folder: Annotated[Positional[Path | None], arg(metavar="FOLDER", help_behavior_hint="")] = None
@@ -23,33 +28,24 @@ class Studio:
     """The next free one is taken where this one is busy."""
     no_open: Flag = False
     """Do not open the browser; print the address only."""
-    debug: Flag = False
-    """Show the traceback of an error."""
 
 
 @dataclass(frozen=True)
-class Watch:
+class Watch(Command):
     """Say of each photo that arrives in a folder whether it is good, where its light stands, and what to shoot next."""
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """Where a tethered camera or a synced phone puts its photos."""
     once: Flag = False
     """Say it of what is there, and end."""
-    debug: Flag = False
-    """Show the traceback of an error."""
 
 
-def do_watch(command: Watch, console: Console) -> None:
+def watch(command: Watch, console: Console) -> None:
     """Look at a folder until Ctrl-C, and print a line for each photo that is new, and what to do next.
 
     Raises:
         UserError: there is no such folder.
     """
-    import time
-
-    from capture.files.names import refuse_no_folder
-    from shadowgraph.terminal import print_lines
-
     refuse_no_folder(command.folder, "the folder in which photos arrive")
     print_lines(console, f"Watching {command.folder}; Ctrl-C ends it.")
     from reconstruct.check.coach import Coach, seen_lines
@@ -66,21 +62,16 @@ def do_watch(command: Watch, console: Console) -> None:
         time.sleep(WATCH_S)
 
 
-def do_studio(command: Studio, console: Console) -> None:
+def studio(command: Studio, console: Console) -> None:
     """Serve the studio until Ctrl-C.
 
     Raises:
         UserError: the folder cannot be used, or no port is free.
     """
-    import webbrowser
-
-    from shadowgraph.terminal import print_lines
     from viewer.studio_server.serve import serve
 
-    def say(line: str) -> None:
-        print_lines(console, line)
-
-    serve(command.folder or default_folder(), command.port, None if command.no_open else webbrowser.open, say)
+    opens = None if command.no_open else webbrowser.open
+    serve(command.folder or default_folder(), command.port, opens, partial(print_lines, console))
 
 
 def default_folder() -> Path:

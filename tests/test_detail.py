@@ -27,7 +27,7 @@ from reconstruct.mesh.simplify import simplified
 from reconstruct.mesh.texture import bake, size_for
 from reconstruct.run.results import detail_is_asked, write_detail
 from reconstruct.run_folder.folder import KEPT, RunFolder
-from reconstruct.run_folder.once import done_once
+from reconstruct.run_folder.once import once
 from reconstruct.scene import build_scene
 from reconstruct.shading.noise import Noise
 from reconstruct.source.photos import read_photos
@@ -165,8 +165,8 @@ def test_the_stage_leaves_a_detail_once_and_decodes_no_reduced_photo_again_that_
         def write() -> None:
             write_detail(source, options, run, again, CalibratedViews.of(ball.calibration), ball.fields)
 
-        assert done_once(run, "detail", "reading", write)
-        assert not done_once(run, "detail", "reading", write)
+        assert once(run, "detail", "reading", write)
+        assert not once(run, "detail", "reading", write)
         assert whole == list(ball.paths) and len(load_details(run.file(DETAIL), ball.fields)) == 1
         assert run.costs["detail"].cpu_seconds > 0
         assert "of memory and" in run.file("log.jsonl").read_text()

@@ -16,9 +16,8 @@ from PIL import Image
 import shadowgraph
 from capture.decode.exr import read_exr
 from capture.errors import ReconstructionError
-from reconstruct.export import formats
+from reconstruct.export import maps
 from reconstruct.export.export import ExportOptions, _imported, export
-from reconstruct.export.maps import read_map
 from reconstruct.mesh.simplify import bounds_a_solid
 from reconstruct.render import relight, studio
 from reconstruct.render.g_buffer import seen_material
@@ -48,15 +47,7 @@ def test_every_format_names_functions_that_are_there(name):
     row = FORMATS[name]
     assert callable(_imported(row.writer)) and callable(_imported(row.reader))
     assert row.title and row.about.endswith(".") and row.suffix.startswith(".")
-
-
-def test_a_format_is_added_behind_another_and_only_once(monkeypatch):
-    monkeypatch.setattr(formats, "FORMATS", {"a": FORMATS["stl"], "b": FORMATS["ply"]})
-    for _ in range(2):
-        formats.add_format("new", FORMATS["off"], after="a")
-        assert list(formats.FORMATS) == ["a", "new", "b"]
-    with pytest.raises(KeyError, match="'c' is none of a, new, b"):
-        formats.add_format("d", FORMATS["off"], after="c")
+    assert list(FORMATS)[1:4] == ["3mf", "html", "turntable"]
 
 
 @pytest.mark.parametrize("name", ["ply", "stl", "off"])
@@ -138,7 +129,7 @@ def test_a_map_that_was_damaged_on_the_disk_is_named_once(run, tmp_path):
     path = written(run, tmp_path, "depth-exr").path
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(ReconstructionError, match=r"does not read back \(.+\)\. Check the disk") as refusal:
-        read_map(StoredRun(run), path)
+        maps.read(StoredRun(run), path)
     assert str(refusal.value).count("does not read back") == 1 and str(path.parent) not in str(refusal.value)
 
 

@@ -404,9 +404,9 @@ def test_a_layout_of_another_program_is_one_module(tmp_path, monkeypatch):
     name = "lamps_of_a_dome"
     (tmp_path / "modules").mkdir()
     (tmp_path / "modules" / f"layout_of_{name}.py").write_text(
-        f"class Layout:\n    layout = 'a layout of {name}'\n    def recognises(self, folder):\n"
-        f"        return '{name}.xyz' if (folder / '{name}.xyz').exists() else None\n"
-        "    def load(self, folder, split):\n        raise NotImplementedError\nIMPORTER = Layout()\n"
+        "from calibration.known_scene import Importer\n"
+        f"find = lambda folder: '{name}.xyz' if (folder / '{name}.xyz').exists() else None\n"
+        f"IMPORTER = Importer('a layout of {name}', find, lambda folder, split: None)\n"
     )
     monkeypatch.setattr(calibration.scenes, "__path__", [*calibration.scenes.__path__, str(tmp_path / "modules")])
     with pytest.raises(CaptureError, match=f"none of the layouts .*a layout of {name}"):

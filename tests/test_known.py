@@ -7,7 +7,7 @@ import pytest
 from dataset_folders import write_shadowneus
 from synthetic import BALL, Look, render
 
-from calibration.scenes.shadowneus import ShadowNeus, load_known_scene
+from calibration.scenes.shadowneus import IMPORTER, load_known_scene
 from capture.errors import CalibrationError, CaptureError, UserError
 from reconstruct.source.photos import read_photos
 from reconstruct.source.source import RunOptions, open_source
@@ -30,7 +30,7 @@ def test_camera_ground_and_point_lights_come_back_as_written(tmp_path):
     truth = write_scene(tmp_path, light_type="point")
     known = load_known_scene(tmp_path)
     camera, expected = known.calibration.camera, truth.calibration.camera
-    assert ShadowNeus().recognises(tmp_path) and known.calibration.unit == "scene"
+    assert IMPORTER.recognises(tmp_path) and known.calibration.unit == "scene"
     assert (camera.cx, camera.cy) == (29.5, 21.5)  # the centre of the picture, where the first pixel centre is (0, 0)
     assert camera.fx == pytest.approx(expected.fx)
     assert np.allclose(known.calibration.world_from_camera.matrix(), truth.calibration.world_from_camera.matrix())

@@ -79,8 +79,9 @@ def test_a_side_without_light_is_named_as_seen_by_the_camera(truth, cover):
     assert side_in_words(to_camera, truth.calibration, np.zeros(3)) == "from the camera's side"
     assert side_in_words(to_camera + np.pi, truth.calibration, np.zeros(3)) == "from behind the object"
     assert side_in_words(np.arctan2(right[1], right[0]), truth.calibration, np.zeros(3)) == "from the right"
+    camera = truth.calibration.posed_camera
     seen_right = some_used(
-        truth, lambda azimuth: abs(from_the_camera(azimuth, truth.calibration, np.zeros(3)) - np.pi / 2) < np.pi / 2
+        truth, lambda azimuth: abs(from_the_camera(azimuth, camera, np.zeros(3)) - np.pi / 2) < np.pi / 2
     )
     found = judge(seen_right, (), cover)
     assert found.grade in ("fair", "poor")

@@ -60,7 +60,7 @@ def test_a_damaged_page_does_not_pass(tmp_path, run, page_file):
     broken = tmp_path / "it.html"
     broken.write_text(page_file.read_text().replace("octet-stream;base64,H4", "octet-stream;base64,H5"))
     with pytest.raises(ReconstructionError, match=r"it\.html does not read back"):
-        stage_page_module.read_page(StoredRun(run), broken)
+        stage_page_module.read(StoredRun(run), broken)
 
 
 # --- in a browser ----------------------------------------------------------------------------------------------------

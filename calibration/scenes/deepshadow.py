@@ -1,6 +1,5 @@
 """Scenes in the layout of DeepShadow: shadow pictures of a relief seen from straight above, with given point lights."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,7 @@ from msgspec import Struct
 
 from calibration.calibration import Calibration
 from calibration.camera import Camera
-from calibration.known_scene import KnownScene
+from calibration.known_scene import Importer, KnownScene
 from calibration.light import Light
 from calibration.pose import Pose
 from calibration.scenes.distant_camera import LOOKING_DOWN
@@ -23,30 +22,12 @@ BACKGROUND = 0.5  # of the silhouette's white: darker pixels are bare ground
 BELOW_LIGHTS = 0.5  # of the distance from the camera to the nearest light: the assumed place of the relief
 
 
-@dataclass(frozen=True)
-class _Row:
-    """One line of all_object_lights.txt."""
-
-    name: str
-    position: np.ndarray  # world
+Row = tuple[str, np.ndarray]  # of all_object_lights.txt: a name, and the light's place, world
 
 
-class DeepShadow:
-    """The importer of this layout."""
-
-    layout = "DeepShadow (all_object_lights.txt)"
-
-    def recognises(self, folder: Path) -> str | None:
-        """The two files that describe it."""
-        is_one = (folder / LIGHTS).is_file() and (folder / PARAMETERS).is_file()
-        return f"{LIGHTS} and {PARAMETERS}" if is_one else None
-
-    def load(self, folder: Path, split: str) -> KnownScene:
-        """As load_deepshadow."""
-        return load_deepshadow(folder)
-
-
-IMPORTER = DeepShadow()
+def _recognised(folder: Path) -> str | None:
+    is_one = (folder / LIGHTS).is_file() and (folder / PARAMETERS).is_file()
+    return f"{LIGHTS} and {PARAMETERS}" if is_one else None
 
 
 class _Parameters(Struct):
@@ -71,7 +52,7 @@ def load_deepshadow(folder: Path) -> KnownScene:
         CalibrationError: a file or field is missing or impossible; the message names both.
     """
     rows = _rows(folder / LIGHTS)
-    pictures = [inside(folder, f"{PICTURES}/{row.name}_shadow1.png", str(folder / LIGHTS)) for row in rows]
+    pictures = [inside(folder, f"{PICTURES}/{name}_shadow1.png", str(folder / LIGHTS)) for name, _ in rows]
     usable = scene_photos(pictures)
     shadow, rows = tuple(usable.paths), [rows[row] for row in usable.rows]
     height, width = read_grey(shadow[0]).shape
@@ -79,15 +60,15 @@ def load_deepshadow(folder: Path) -> KnownScene:
     focal = given.focal_length
     eye = np.array([given.cam_location_x, given.cam_location_y, given.cam_location_z])
     camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
-    lights = tuple(Light(path.name, "point", position=row.position) for row, path in zip(rows, shadow, strict=True))
-    nearest = min(float(np.linalg.norm(row.position - eye)) for row in rows)
-    lowest = min(float(row.position[2]) for row in rows)
+    lights = tuple(Light(path.name, "point", position=place) for (_, place), path in zip(rows, shadow, strict=True))
+    nearest = min(float(np.linalg.norm(place - eye)) for _, place in rows)
+    lowest = min(float(place[2]) for _, place in rows)
     ground = min(eye[2] - BELOW_LIGHTS * nearest, lowest - 0.5 * BELOW_LIGHTS * nearest)
     return KnownScene(
         Calibration(camera, Pose(LOOKING_DOWN, eye), float(ground), lights, unit="scene"),
         rgb_paths=None,
         shadow_paths=shadow,
-        mask_path=_silhouette(folder, rows[0].name),
+        mask_path=_silhouette(folder, rows[0][0]),
         photos_left_out=usable.left_out,
         every_photo=usable.every,
         mask_is_grey=True,
@@ -95,7 +76,7 @@ def load_deepshadow(folder: Path) -> KnownScene:
     )
 
 
-def _rows(path: Path) -> list[_Row]:
+def _rows(path: Path) -> list[Row]:
     rows = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         words = line.split()
@@ -107,7 +88,7 @@ def _rows(path: Path) -> list[_Row]:
             position = np.zeros(0)
         if position.shape != (3,) or not np.isfinite(position).all() or Path(words[0]).name != words[0]:
             raise CalibrationError(f"{path}, line {number} is {line[:60]!r}; a name and x y z of its light are needed.")
-        rows.append(_Row(words[0], position))
+        rows.append((words[0], position))
     if not rows:
         raise CalibrationError(f"{path} names no picture; a line 'name x y z' for each is needed.")
     return rows
@@ -119,3 +100,6 @@ def _silhouette(folder: Path, first: str) -> Path | None:
     if not path.is_file() or (read_grey(path) >= BACKGROUND).all():
         return None
     return path
+
+
+IMPORTER = Importer("DeepShadow (all_object_lights.txt)", _recognised, lambda folder, _: load_deepshadow(folder))

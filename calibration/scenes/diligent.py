@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from calibration.known_scene import KnownScene
+from calibration.known_scene import Importer, KnownScene
 from calibration.lights.photo_lists import dark_photos, folders_of, match, photos_in
 from calibration.scenes.distant_camera import distant_light, distant_scene, picture_camera
 from capture.decode.formats import decode
@@ -22,56 +22,48 @@ from capture.session.scene_photos import scene_photos
 DIRECTIONS, INTENSITIES, NAMES, MASK = "light_directions.txt", "light_intensities.txt", "filenames.txt", "mask.png"
 
 
-class Diligent:
-    """The importer of this layout."""
+def _recognised(folder: Path) -> str | None:
+    is_one = (folder / DIRECTIONS).is_file() and any(photos_in(place) for place in folders_of(folder))
+    return f"{DIRECTIONS} and photos" if is_one else None
 
-    layout = "DiLiGenT (light_directions.txt)"
 
-    def recognises(self, folder: Path) -> str | None:
-        """light_directions.txt, and photos."""
-        is_one = (folder / DIRECTIONS).is_file() and any(photos_in(place) for place in folders_of(folder))
-        return f"{DIRECTIONS} and photos" if is_one else None
+def _load(folder: Path, split: str) -> KnownScene:
+    """Photos and directional lights in the picture's frame; the ground is unknown.
 
-    def load(self, folder: Path, split: str) -> KnownScene:
-        """Photos and directional lights in the picture's frame; the ground is unknown.
-
-        Raises:
-            CalibrationError, CaptureError: a file is missing or damaged, or the files do not fit each other.
-        """
-        towards = _table(folder / DIRECTIONS)
-        listed, how = _photos(folder, len(towards))
-        photos = scene_photos(listed)
-        place = photos.paths[0].parent
-        strength = np.ones_like(towards)
-        if (folder / INTENSITIES).is_file():
-            strength = _table(folder / INTENSITIES, len(towards))
-        if (strength <= 0).any() or not np.linalg.norm(towards, axis=1).all():
-            row = int(np.flatnonzero((strength <= 0).any(1) | (np.linalg.norm(towards, axis=1) == 0))[0])
-            raise CalibrationError(
-                f"{folder}: light {row + 1} is {strength[row].tolist()} from {towards[row].tolist()}; an intensity "
-                f"above 0 and a direction were needed. Correct {INTENSITIES} or {DIRECTIONS}."
-            )
-        is_linear = True if decode(photos.paths[0]).pixels.dtype != np.uint8 else None
-        posed_camera, camera_note = picture_camera(photos.paths)
-        rows = zip(listed, towards, strength / strength.mean(), strict=True)
-        lights = tuple(distant_light(path.name, where, power) for path, where, power in rows)
-        curve = "; pixel values linear, as 16-bit files of this layout are" if is_linear else ""
-        found = f"lights: {len(lights)} directions, photos {how}{curve}"
-        notes, has_ratios = (found, camera_note), (folder / INTENSITIES).is_file()
-        mask = folder / MASK if (folder / MASK).is_file() else place / MASK
-        return distant_scene(
-            photos,
-            lights,
-            posed_camera,
-            mask,
-            notes,
-            is_linear,
-            has_ratios=has_ratios,
-            dark=dark_photos(folder, listed),
+    Raises:
+        CalibrationError, CaptureError: a file is missing or damaged, or the files do not fit each other.
+    """
+    towards = _table(folder / DIRECTIONS)
+    listed, how = _photos(folder, len(towards))
+    photos = scene_photos(listed)
+    place = photos.paths[0].parent
+    strength = np.ones_like(towards)
+    if (folder / INTENSITIES).is_file():
+        strength = _table(folder / INTENSITIES, len(towards))
+    if (strength <= 0).any() or not np.linalg.norm(towards, axis=1).all():
+        row = int(np.flatnonzero((strength <= 0).any(1) | (np.linalg.norm(towards, axis=1) == 0))[0])
+        raise CalibrationError(
+            f"{folder}: light {row + 1} is {strength[row].tolist()} from {towards[row].tolist()}; an intensity "
+            f"above 0 and a direction were needed. Correct {INTENSITIES} or {DIRECTIONS}."
         )
-
-
-IMPORTER = Diligent()
+    is_linear = True if decode(photos.paths[0]).pixels.dtype != np.uint8 else None
+    posed_camera, camera_note = picture_camera(photos.paths)
+    rows = zip(listed, towards, strength / strength.mean(), strict=True)
+    lights = tuple(distant_light(path.name, where, power) for path, where, power in rows)
+    curve = "; pixel values linear, as 16-bit files of this layout are" if is_linear else ""
+    found = f"lights: {len(lights)} directions, photos {how}{curve}"
+    notes, has_ratios = (found, camera_note), (folder / INTENSITIES).is_file()
+    mask = folder / MASK if (folder / MASK).is_file() else place / MASK
+    return distant_scene(
+        photos,
+        lights,
+        posed_camera,
+        mask,
+        notes,
+        is_linear,
+        has_ratios=has_ratios,
+        dark=dark_photos(folder, listed),
+    )
 
 
 def _photos(folder: Path, n_lights: int) -> tuple[list[Path], str]:
@@ -113,3 +105,6 @@ def _table(path: Path, n_rows: int | None = None) -> Float[np.ndarray, "rows 3"]
     if n_rows is not None and len(table) != n_rows:
         raise CalibrationError(f"{path} holds {len(table)} rows, {n_rows} were needed: one for each light.")
     return table
+
+
+IMPORTER = Importer("DiLiGenT (light_directions.txt)", _recognised, _load)

@@ -32,9 +32,8 @@ SCALE_NOTE = "scale: unknown; one unit of the result is about one pixel of the p
 LOWEST = 0.02  # sine of a light's angle over the picture: below (1 degree) nothing that faces the camera is lit
 
 
-def distant_camera(width: int, height: int) -> PosedCamera:
-    """Return a camera FAR away that looks along -z at the origin; the ground is assumed at z = 0."""
-    focal = FAR * max(width, height)
+def _looking_down(width: int, height: int, focal: float) -> PosedCamera:
+    """Return a camera that looks along -z at the origin from the height of its focal length; the ground is z = 0."""
     camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
     return PosedCamera(camera, Pose(LOOKING_DOWN, np.array([0.0, 0.0, focal])), 0.0)
 
@@ -55,15 +54,14 @@ def picture_camera(photos: Sequence[Path]) -> tuple[PosedCamera, str]:
     exif = read_exif(photos[sizes.index((width, height))])
     focal_35mm = focal_of(exif)
     if focal_35mm is None or _is_cropped(exif.get_ifd(EXIF_TAGS), width, height):
-        distant = distant_camera(width, height)
+        distant = _looking_down(width, height, FAR * max(width, height))
         return distant, (
             f"camera: the files do not state it; a distant one was assumed (focal length {distant.camera.fx:.0f} px, "
             f"{FAR:g} times the picture's longer side, no distortion)"
         )
     focal = focal_in_pixels(focal_35mm, width, height)
-    camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
     note = f"camera: focal length {focal:.0f} px from EXIF ({focal_35mm:g} mm on 35 mm film); no distortion was assumed"
-    return PosedCamera(camera, Pose(LOOKING_DOWN, np.array([0.0, 0.0, focal])), 0.0), note
+    return _looking_down(width, height, focal), note
 
 
 def _is_cropped(exif: dict[int, object], width: int, height: int) -> bool:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from calibration.known_scene import Importer, KnownScene
-from calibration.scenes.listed_lights import ListedLights
+from calibration.scenes.listed_lights import listed_lights
 from calibration.scenes.own_scene import save_scene
 from capture.errors import CaptureError
 from capture.files.names import refuse_no_folder
@@ -40,14 +40,12 @@ def find_importer(folder: Path, lights: Path | None = None) -> Importer | None:
     if (folder / BOARD).exists() or (is_a_capture and _names_a_board(folder)):
         return None
     named = _name_in(folder, lights)
-    by_list = ListedLights(lights if lights is not None and lights.is_file() else None)
-    others = () if is_a_capture else (one for one in importers() if not isinstance(one, ListedLights))
-    every = (*others, by_list)
+    others = () if is_a_capture else (one for one in importers() if not one.gives_way)
+    every = (*others, listed_lights(lights if lights is not None and lights.is_file() else None))
     found = [(importer, importer.recognises(folder)) for importer in every]
-    reasons = [(i, why) for i, why in found if why is not None]
-    reasons = [(i, why) for i, why in reasons if isinstance(i, ListedLights) or not (named and why.startswith(named))]
-    if len(reasons) > 1:  # other layouts know more than a list does
-        reasons = [(i, why) for i, why in reasons if not isinstance(i, ListedLights)]
+    reasons = [(i, why) for i, why in found if why and (i.gives_way or not (named and why.startswith(named)))]
+    if len(reasons) > 1:
+        reasons = [(i, why) for i, why in reasons if not i.gives_way]
     if len(reasons) > 1:
         listed = " and ".join(f"{importer.layout} by {reason}" for importer, reason in reasons)
         raise CaptureError(

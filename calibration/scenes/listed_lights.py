@@ -8,13 +8,13 @@ Photos without board and list of lights, in which a shiny ball shows where the l
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from calibration.calibration import Calibration, load_calibration
-from calibration.known_scene import KnownScene
+from calibration.known_scene import Importer, KnownScene
 from calibration.light import Light
 from calibration.lights.files import GivenLights, NoMatchError, is_calibration, is_number_list, read_lights
 from calibration.lights.layouts import view_note
@@ -95,44 +95,40 @@ def load_with_ball(folder: Path, circle: tuple[float, float, float] | None) -> K
     return replace(scene, left_out=(ball.x, ball.y, GROWN * ball.radius))
 
 
-@dataclass(frozen=True)
-class ListedLights:
-    """The importer of photos with a file of lights: the user's, or the only one that lies beside them."""
+def lists(folder: Path, given: Path | None) -> list[Path]:
+    """Return the user's file of lights, or those of a list's usual names."""
+    return [given] if given else [path for kind in KINDS for path in sorted(folder.glob(kind))]
 
-    given: Path | None = None  # by --lights
 
-    layout = "photos with a list of lights (.lp, .csv, .mat, .dome, lights.json)"
+def listed_lights(given: Path | None = None) -> Importer:
+    """Return the importer of photos with a file of lights: the user's, or the only one that lies beside them."""
 
-    def recognises(self, folder: Path) -> str | None:
-        """The file's name, if it gives a light to every photo: then none of them is the photo of a board.
+    def recognised(folder: Path) -> str | None:
+        """Return the file's name, if it gives a light to every photo: then none of them is the photo of a board.
 
         Raises:
             CalibrationError: the user's file cannot be read; one that only lies there need not be of lights.
         """
-        beside = self.lists(folder)
+        beside = lists(folder, given)
         try:
             return beside[0].name if len(beside) == 1 and _photos_of(folder, beside[0]) is not None else None
         except CalibrationError:
-            if self.given is not None:
+            if given is not None:
                 raise
             return None
 
-    def load(self, folder: Path, split: str) -> KnownScene:
-        """As load_listed."""
-        scene = load_listed(folder, self.lists(folder)[0])
-        return replace(scene, lights_from=self.given)
+    def load(folder: Path, split: str) -> KnownScene:
+        return replace(load_listed(folder, lists(folder, given)[0]), lights_from=given)
 
-    def lists(self, folder: Path) -> list[Path]:
-        """Return the user's file, or those of a list's usual names."""
-        return [self.given] if self.given else [path for kind in KINDS for path in sorted(folder.glob(kind))]
+    return Importer("photos with a list of lights (.lp, .csv, .mat, .dome, lights.json)", recognised, load, True)
 
 
-IMPORTER = ListedLights()
+IMPORTER = listed_lights()
 
 
 def why_unused(folder: Path) -> str:
     """Return why the file of lights that lies beside photos gives no light to each; "" where none lies there."""
-    for source in ListedLights().lists(folder):
+    for source in lists(folder, None):
         try:
             load_listed(folder, source)
         except NoMatchError as error:

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Struct
 
 from calibration.calibration import load_calibration, save_calibration
-from calibration.known_scene import KnownScene
+from calibration.known_scene import Importer, KnownScene
 from calibration.lights.photo_lists import DARK, photos_in
 from capture.errors import CalibrationError, CaptureError
 from capture.files.atomic import atomic_folder, write_json
@@ -37,52 +37,43 @@ class _Marker(Struct):
     notes: tuple[Text, ...]
 
 
-class OwnScene:
-    """The importer of this layout."""
+def _load(folder: Path, split: str) -> KnownScene:
+    """Load the imported scene, without photos that cannot be used.
 
-    layout = "Shadowgraph (import.json)"
-
-    def recognises(self, folder: Path) -> str | None:
-        """import.json."""
-        return MARKER if (folder / MARKER).is_file() else None
-
-    def load(self, folder: Path, split: str) -> KnownScene:
-        """Load the imported scene, without photos that cannot be used.
-
-        Raises:
-            CalibrationError, CaptureError: a file or entry is missing or impossible; the message names both.
-        """
-        source = folder / MARKER
-        given = read_scene(source, _Marker)
-        calibration = load_calibration((folder / CALIBRATION).resolve())  # links in a capture are followed
-        names = list(dict.fromkeys(light.photo for light in calibration.lights))
-        rgb, shadows = (
-            tuple(inside(folder, f"{place}/{name}", f"{folder / CALIBRATION}: 'photo'") for name in names)
-            if is_there
-            else None
-            for place, is_there in ((PHOTOS, given.photos), (SHADOWS, given.shadows))
-        )
-        if rgb is None and shadows is None:
-            raise CalibrationError(f"{source}: neither '{PHOTOS}' nor '{SHADOWS}' is true; one of them was needed.")
-        usable = scene_photos(*(paths for paths in (rgb, shadows) if paths))
-        kept = {names[row] for row in usable.rows}
-        mask = folder / MASK
-        return KnownScene(
-            replace(calibration, lights=tuple(light for light in calibration.lights if light.photo in kept)),
-            rgb and tuple(rgb[row] for row in usable.rows),
-            shadows and tuple(shadows[row] for row in usable.rows),
-            mask if mask.is_file() else None,
-            mask_is_grey=True,
-            ground_known=given.ground_known,
-            is_linear=given.linear,
-            dark_paths=tuple(photos_in(folder / DARK)),
-            notes=given.notes,
-            photos_left_out=usable.left_out,
-            every_photo=tuple(names),
-        )
+    Raises:
+        CalibrationError, CaptureError: a file or entry is missing or impossible; the message names both.
+    """
+    source = folder / MARKER
+    given = read_scene(source, _Marker)
+    calibration = load_calibration((folder / CALIBRATION).resolve())  # links in a capture are followed
+    names = list(dict.fromkeys(light.photo for light in calibration.lights))
+    rgb, shadows = (
+        tuple(inside(folder, f"{place}/{name}", f"{folder / CALIBRATION}: 'photo'") for name in names)
+        if is_there
+        else None
+        for place, is_there in ((PHOTOS, given.photos), (SHADOWS, given.shadows))
+    )
+    if rgb is None and shadows is None:
+        raise CalibrationError(f"{source}: neither '{PHOTOS}' nor '{SHADOWS}' is true; one of them was needed.")
+    usable = scene_photos(*(paths for paths in (rgb, shadows) if paths))
+    kept = {names[row] for row in usable.rows}
+    mask = folder / MASK
+    return KnownScene(
+        replace(calibration, lights=tuple(light for light in calibration.lights if light.photo in kept)),
+        rgb and tuple(rgb[row] for row in usable.rows),
+        shadows and tuple(shadows[row] for row in usable.rows),
+        mask if mask.is_file() else None,
+        mask_is_grey=True,
+        ground_known=given.ground_known,
+        is_linear=given.linear,
+        dark_paths=tuple(photos_in(folder / DARK)),
+        notes=given.notes,
+        photos_left_out=usable.left_out,
+        every_photo=tuple(names),
+    )
 
 
-IMPORTER = OwnScene()
+IMPORTER = Importer("Shadowgraph (import.json)", lambda folder: MARKER if (folder / MARKER).is_file() else None, _load)
 
 
 def save_scene(scene: KnownScene, layout: str, out: Path) -> None:

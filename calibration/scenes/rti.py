@@ -7,41 +7,33 @@ beside theirs (assembly-files/ and jpeg-exports/ of RTIBuilder).
 
 from pathlib import Path
 
-from calibration.known_scene import KnownScene
+from calibration.known_scene import Importer, KnownScene
 from calibration.lights.photo_lists import folders_of, photos_in
 from calibration.scenes.listed_lights import load_listed
 from capture.errors import CalibrationError, Remedy
 
 
-class Rti:
-    """The importer of RTI folders."""
-
-    layout = "RTI (.lp)"
-
-    def recognises(self, folder: Path) -> str | None:
-        """An .lp file, and photos."""
-        lists = _lists(folder)
-        has_photos = bool(lists) and any(photos_in(place) for place in folders_of(folder))
-        return f"{lists[0].relative_to(folder)} and photos" if has_photos else None
-
-    def load(self, folder: Path, split: str) -> KnownScene:
-        """Photos and directional lights in the picture's frame; the ground is unknown.
-
-        Raises:
-            CalibrationError, CaptureError: several lists, a line that is no light, or lines that fit no photos.
-        """
-        lists = _lists(folder)
-        if len(lists) > 1:
-            names = ", ".join(str(path.relative_to(folder)) for path in lists)
-            raise CalibrationError(
-                f"{folder} holds {len(lists)} lists of lights ({names}), one was needed.",
-                "remove the others",
-                Remedy.LIGHTS_FILE,
-            )
-        return load_listed(folder, lists[0])
+def _recognised(folder: Path) -> str | None:
+    lists = _lists(folder)
+    has_photos = bool(lists) and any(photos_in(place) for place in folders_of(folder))
+    return f"{lists[0].relative_to(folder)} and photos" if has_photos else None
 
 
-IMPORTER = Rti()
+def _load(folder: Path, split: str) -> KnownScene:
+    """Photos and directional lights in the picture's frame; the ground is unknown.
+
+    Raises:
+        CalibrationError, CaptureError: several lists, a line that is no light, or lines that fit no photos.
+    """
+    lists = _lists(folder)
+    if len(lists) > 1:
+        names = ", ".join(str(path.relative_to(folder)) for path in lists)
+        raise CalibrationError(
+            f"{folder} holds {len(lists)} lists of lights ({names}), one was needed.",
+            "remove the others",
+            Remedy.LIGHTS_FILE,
+        )
+    return load_listed(folder, lists[0])
 
 
 def _lists(folder: Path) -> list[Path]:
@@ -51,3 +43,6 @@ def _lists(folder: Path) -> list[Path]:
         if found:
             return found
     return []
+
+
+IMPORTER = Importer("RTI (.lp)", _recognised, _load)

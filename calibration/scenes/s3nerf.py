@@ -18,7 +18,7 @@ from msgspec import Meta, Struct
 
 from calibration.calibration import Calibration
 from calibration.camera import Camera
-from calibration.known_scene import KnownScene
+from calibration.known_scene import Importer, KnownScene
 from calibration.light import Light
 from calibration.lights.known_ground import find_ground_height, preview
 from calibration.lights.layouts import lamps
@@ -61,60 +61,53 @@ class _Parameters(Struct):
         return Camera(self.imhw[1], self.imhw[0], fx, fy, cx - 0.5, cy - 0.5)
 
 
-class S3Nerf:
-    """The importer of this layout."""
+def _recognised(folder: Path) -> str | None:
+    """Look for params.json beside rgb/; DeepShadow has the file, but not the folder."""
+    is_one = (folder / PARAMETERS).is_file() and bool(photos_in(folder / PHOTOS))
+    return f"{PARAMETERS} and {PHOTOS}/" if is_one else None
 
-    layout = "S3-NeRF (params.json with K)"
 
-    def recognises(self, folder: Path) -> str | None:
-        """Look for params.json beside rgb/; DeepShadow has the file, but not the folder."""
-        is_one = (folder / PARAMETERS).is_file() and bool(photos_in(folder / PHOTOS))
-        return f"{PARAMETERS} and {PHOTOS}/" if is_one else None
+def _load(folder: Path, split: str) -> KnownScene:
+    """Load camera, point lights, photos, and the ground if shading gives its height; else in the picture's frame.
 
-    def load(self, folder: Path, split: str) -> KnownScene:
-        """Load camera, point lights, photos, and the ground if shading gives its height; else in the picture's frame.
-
-        Raises:
-            CalibrationError, CaptureError: a file or field is missing or impossible; the message names both.
-        """
-        source = folder / PARAMETERS
-        content = read_json(source)
-        parameters = as_type(content, _Parameters, str(source), EXPORT)
-        is_captured = "light_pos" not in content
-        if is_captured:
-            given = _captured(parameters, folder)
-        else:
-            pose, places = lamps(content, source)
-            given = _Given(PosedCamera(parameters.camera(), pose, 0.0), places, "")
-        found_photos, rows = _numbered(folder / PHOTOS, len(given.places), source)
-        shadows = [folder / SHADOWS / path.name for path in found_photos]
-        has_shadows = all(path.is_file() for path in shadows)
-        usable = scene_photos(found_photos, *([shadows] if has_shadows else []))
-        photos, rows = usable.paths, [rows[row] for row in usable.rows]
-        size, camera = read_size(photos[0]), given.posed_camera.camera
-        if size != (camera.width, camera.height):
-            raise CalibrationError(
-                f"{source}: 'imhw' is {camera.height} x {camera.width} and {photos[0].name} is {size[1]} x "
-                f"{size[0]} (rows x columns); equal sizes were needed. Use the photos that the file describes."
-            )
-        given = replace(given, places=given.places[rows])
-        calibration, found = _grounded(given, photos, is_captured)
-        mask = folder / MASK
-        return KnownScene(
-            with_common_power(calibration, preview(photos, is_linear=True)),
-            tuple(photos),
-            tuple(folder / SHADOWS / path.name for path in photos) if has_shadows else None,
-            mask if mask.is_file() else None,
-            mask_is_grey=True,
-            ground_known=found is not None,
-            is_linear=True,
-            notes=tuple(filter(None, (given.note, found, "photos: pixel values are linear, as in this layout"))),
-            photos_left_out=usable.left_out,
-            every_photo=usable.every,
+    Raises:
+        CalibrationError, CaptureError: a file or field is missing or impossible; the message names both.
+    """
+    source = folder / PARAMETERS
+    content = read_json(source)
+    parameters = as_type(content, _Parameters, str(source), EXPORT)
+    is_captured = "light_pos" not in content
+    if is_captured:
+        given = _captured(parameters, folder)
+    else:
+        pose, places = lamps(content, source)
+        given = _Given(PosedCamera(parameters.camera(), pose, 0.0), places, "")
+    found_photos, rows = _numbered(folder / PHOTOS, len(given.places), source)
+    shadows = [folder / SHADOWS / path.name for path in found_photos]
+    has_shadows = all(path.is_file() for path in shadows)
+    usable = scene_photos(found_photos, *([shadows] if has_shadows else []))
+    photos, rows = usable.paths, [rows[row] for row in usable.rows]
+    size, camera = read_size(photos[0]), given.posed_camera.camera
+    if size != (camera.width, camera.height):
+        raise CalibrationError(
+            f"{source}: 'imhw' is {camera.height} x {camera.width} and {photos[0].name} is {size[1]} x "
+            f"{size[0]} (rows x columns); equal sizes were needed. Use the photos that the file describes."
         )
-
-
-IMPORTER = S3Nerf()
+    given = replace(given, places=given.places[rows])
+    calibration, found = _grounded(given, photos, is_captured)
+    mask = folder / MASK
+    return KnownScene(
+        with_common_power(calibration, preview(photos, is_linear=True)),
+        tuple(photos),
+        tuple(folder / SHADOWS / path.name for path in photos) if has_shadows else None,
+        mask if mask.is_file() else None,
+        mask_is_grey=True,
+        ground_known=found is not None,
+        is_linear=True,
+        notes=tuple(filter(None, (given.note, found, "photos: pixel values are linear, as in this layout"))),
+        photos_left_out=usable.left_out,
+        every_photo=usable.every,
+    )
 
 
 def _grounded(given: _Given, photos: list[Path], is_captured: bool) -> tuple[Calibration, str | None]:
@@ -166,3 +159,6 @@ def _numbered(folder: Path, n_rows: int, source: Path) -> tuple[list[Path], list
             f"{n_rows}, each once, were needed."
         )
     return photos, rows
+
+
+IMPORTER = Importer("S3-NeRF (params.json with K)", _recognised, _load)

@@ -11,7 +11,7 @@ from msgspec import Meta, Struct
 
 from calibration.calibration import Calibration
 from calibration.camera import Camera
-from calibration.known_scene import KnownScene
+from calibration.known_scene import Importer, KnownScene
 from calibration.light import Light
 from calibration.lights.known_ground import shading_misfit
 from calibration.lights.layouts import FROM_BLENDER, Floor, Frame, Frames
@@ -37,22 +37,8 @@ class _Description(Frames):
     camera_angle_x: Annotated[float, Meta(gt=0, lt=np.pi, description="radians between 0 and pi")]
 
 
-class ShadowNeus:
-    """The importer of this layout."""
-
-    layout = "ShadowNeuS, rendered (transforms_*.json)"
-
-    def recognises(self, folder: Path) -> str | None:
-        """transforms_train*.json (any split)."""
-        files = sorted(folder.glob("transforms_train*.json"))
-        return files[0].name if files else None
-
-    def load(self, folder: Path, split: str) -> KnownScene:
-        """As load_known_scene."""
-        return load_known_scene(folder, split)
-
-
-IMPORTER = ShadowNeus()
+def _recognised(folder: Path) -> str | None:
+    return next((path.name for path in sorted(folder.glob("transforms_train*.json"))), None)
 
 
 def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
@@ -178,3 +164,6 @@ def _light(matrix: Float[np.ndarray, "4 4"], photo: str, kind: str, height: floa
     if kind == "point":
         return Light(photo, kind, position=place)
     return Light(photo, kind, direction=towards / max(float(np.linalg.norm(towards)), 1e-12))
+
+
+IMPORTER = Importer("ShadowNeuS, rendered (transforms_*.json)", _recognised, load_known_scene)

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.calibration import Calibration
 from calibration.camera import Camera
-from calibration.known_scene import KnownScene
+from calibration.known_scene import Importer, KnownScene
 from calibration.light import Light
 from calibration.lights.known_ground import preview
 from calibration.lights.layouts import rigid
@@ -27,68 +27,60 @@ ARRAYS = ("light_pose", "camera_pose", "camera_intrinsics", "floor_height")
 TRAIN = "train"
 
 
-class ShadowNeusReal:
-    """The importer of this layout."""
+def _recognised(folder: Path) -> str | None:
+    files = sorted(folder.glob("params*.npz"))
+    is_one = bool(files) and bool(photos_in(folder / PHOTOS))
+    return f"{files[0].name} and {PHOTOS}/" if is_one else None
 
-    layout = "ShadowNeuS, photographs (params.npz)"
 
-    def recognises(self, folder: Path) -> str | None:
-        """params.npz or params_SPLIT.npz beside image/."""
-        files = sorted(folder.glob("params*.npz"))
-        is_one = bool(files) and bool(photos_in(folder / PHOTOS))
-        return f"{files[0].name} and {PHOTOS}/" if is_one else None
+def _load(folder: Path, split: str) -> KnownScene:
+    """Load camera, ground, point lights (world) and photos.
 
-    def load(self, folder: Path, split: str) -> KnownScene:
-        """Load camera, ground, point lights (world) and photos.
+    Args:
+        split: "train" reads params.npz where there is no params_train.npz.
 
-        Args:
-            split: "train" reads params.npz where there is no params_train.npz.
-
-        Raises:
-            CalibrationError, CaptureError: an array is missing or impossible, or does not fit the photos.
-        """
-        source = folder / f"params_{split}.npz"
-        if split == TRAIN and not source.is_file():
-            source = folder / "params.npz"
-        content = read_npz(source, ARRAYS)
-        poses, floor = content["light_pose"], content["floor_height"]
-        if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
-            raise CalibrationError(f"{source}: light_pose has the shape {poses.shape}, N x 4 x 4 finite were needed.")
-        if floor.size != 1 or not np.isfinite(floor).all():
-            raise CalibrationError(f"{source}: floor_height holds {floor.size} numbers, one finite one was needed.")
-        height, pose = float(floor.reshape(())), rigid(content["camera_pose"], str(source), "camera_pose")
-        photos = photos_in(folder / PHOTOS)
-        if len(photos) != len(poses):
-            raise CalibrationError(
-                f"{source}: light_pose gives {len(poses)} lights and {folder / PHOTOS} holds {len(photos)} photos; as "
-                "many were needed, in the same order."
-            )
-        usable = scene_photos(photos)
-        photos, poses = usable.paths, poses[usable.rows]
-        camera = _camera(content["camera_intrinsics"], read_size(photos[0]), source)
-        low = [path.name for path, place in zip(photos, poses[:, 2, 3], strict=True) if place <= height]
-        if pose.translation[2] <= height or low:
-            raise CalibrationError(
-                f"{source}: floor_height {height:g} lies above {f'the light of {low[0]}' if low else 'the camera'}; a "
-                "floor below it was needed (world z is up)."
-            )
-        lights = [Light(path.name, "point", position=m[:3, 3].copy()) for path, m in zip(photos, poses, strict=True)]
-        calibration = Calibration(camera, pose, height, tuple(lights), unit="scene")
-        notes = ["lights: assumed at the camera of the phone that held them"]
-        if (folder / MASK).is_file():
-            notes.append(f"{MASK}: not used, it marks all possible object pixels; the outline is found from the photos")
-        return KnownScene(
-            with_common_power(calibration, preview(photos)),
-            tuple(photos),
-            None,
-            None,
-            notes=tuple(notes),
-            photos_left_out=usable.left_out,
-            every_photo=usable.every,
+    Raises:
+        CalibrationError, CaptureError: an array is missing or impossible, or does not fit the photos.
+    """
+    source = folder / f"params_{split}.npz"
+    if split == TRAIN and not source.is_file():
+        source = folder / "params.npz"
+    content = read_npz(source, ARRAYS)
+    poses, floor = content["light_pose"], content["floor_height"]
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
+        raise CalibrationError(f"{source}: light_pose has the shape {poses.shape}, N x 4 x 4 finite were needed.")
+    if floor.size != 1 or not np.isfinite(floor).all():
+        raise CalibrationError(f"{source}: floor_height holds {floor.size} numbers, one finite one was needed.")
+    height, pose = float(floor.reshape(())), rigid(content["camera_pose"], str(source), "camera_pose")
+    photos = photos_in(folder / PHOTOS)
+    if len(photos) != len(poses):
+        raise CalibrationError(
+            f"{source}: light_pose gives {len(poses)} lights and {folder / PHOTOS} holds {len(photos)} photos; as "
+            "many were needed, in the same order."
         )
-
-
-IMPORTER = ShadowNeusReal()
+    usable = scene_photos(photos)
+    photos, poses = usable.paths, poses[usable.rows]
+    camera = _camera(content["camera_intrinsics"], read_size(photos[0]), source)
+    low = [path.name for path, place in zip(photos, poses[:, 2, 3], strict=True) if place <= height]
+    if pose.translation[2] <= height or low:
+        raise CalibrationError(
+            f"{source}: floor_height {height:g} lies above {f'the light of {low[0]}' if low else 'the camera'}; a "
+            "floor below it was needed (world z is up)."
+        )
+    lights = [Light(path.name, "point", position=m[:3, 3].copy()) for path, m in zip(photos, poses, strict=True)]
+    calibration = Calibration(camera, pose, height, tuple(lights), unit="scene")
+    notes = ["lights: assumed at the camera of the phone that held them"]
+    if (folder / MASK).is_file():
+        notes.append(f"{MASK}: not used, it marks all possible object pixels; the outline is found from the photos")
+    return KnownScene(
+        with_common_power(calibration, preview(photos)),
+        tuple(photos),
+        None,
+        None,
+        notes=tuple(notes),
+        photos_left_out=usable.left_out,
+        every_photo=usable.every,
+    )
 
 
 def _camera(intrinsics: np.ndarray, size: tuple[int, int], source: Path) -> Camera:
@@ -105,3 +97,6 @@ def _camera(intrinsics: np.ndarray, size: tuple[int, int], source: Path) -> Came
             f"{size[1]} pixels; the intrinsics of these photos were needed."
         )
     return Camera(*size, fx, fy, cx - 0.5, cy - 0.5)
+
+
+IMPORTER = Importer("ShadowNeuS, photographs (params.npz)", _recognised, _load)

@@ -19,7 +19,7 @@ from capture.errors import CalibrationError, CaptureError, UserError
 from capture.session.seen import SeenPhotos
 from capture.session.session import ADVISED_LIT, Session, load_settings
 from capture.session.sorting import tripod_first
-from reconstruct.check.light_coverage import SIDES, azimuth_from_camera
+from reconstruct.check.light_coverage import SIDES, from_the_camera
 
 LOW = 60.0  # degrees: a light higher than that says little about the sides
 PLENTY = 25  # photos from which more add little, as the verdict counts
@@ -65,8 +65,11 @@ class Coach:
         last = max((one.place for one in photos), default=0)  # of the tripod: where it stands now
         lit = [one.name for one in photos if one.role == "lit" and one.place == last and not one.drop]
         board = [one.name for one in photos if one.role == "board" and one.place == last and not one.drop]
-        if not board or len(lit) < 4:
-            return Coached(photos, advice=_first_words(bool(board), len(lit)))
+        if not board:
+            return Coached(photos, advice="Next: photograph the board in room light, from where the camera will stay.")
+        if len(lit) < 4:
+            of = f"{4 - len(lit)} photos of the object, the flashlight in another place each time."
+            return Coached(photos, advice=f"Next: room light off, and {of}")
         camera = self._camera(board, lit)
         if isinstance(camera, str):
             return Coached(photos, advice=camera)
@@ -120,7 +123,7 @@ class Coach:
         evidence = _thinned(evidence)
         fit = fit_flashlights(first_guess(evidence), evidence, free_tangent)
         ways = fit.flashlights.positions - evidence.cells.centre
-        azimuths = [azimuth_from_camera(float(np.arctan2(y, x)), camera, evidence.cells.centre) for x, y, _ in ways]
+        azimuths = [from_the_camera(float(np.arctan2(y, x)), camera, evidence.cells.centre) for x, y, _ in ways]
         heights = np.degrees(np.arcsin(ways[:, 2] / np.linalg.norm(ways, axis=1)))
         return tuple(
             SeenLight(lit[int(photo)], round(float(np.degrees(azimuth)), 1), round(float(height), 1))
@@ -189,9 +192,3 @@ def _middle_of_widest(missing: tuple[int, ...]) -> int:
         if (start - 1) % count not in missing and length > longest:
             best, longest = (start + length // 2) % count, length
     return best
-
-
-def _first_words(has_board: bool, lit: int) -> str:
-    if not has_board:
-        return "Next: photograph the board in room light, from where the camera will stay."
-    return f"Next: room light off, and {4 - lit} photos of the object, the flashlight in another place each time."

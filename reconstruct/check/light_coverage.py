@@ -176,13 +176,8 @@ def widest_gap(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> tupl
     return float(azimuth[widest]), float(gaps[widest])
 
 
-def from_the_camera(azimuth: float, calibration: Calibration, centre: Float[np.ndarray, "3"]) -> float:
+def from_the_camera(azimuth: float, camera: PosedCamera, centre: Float[np.ndarray, "3"]) -> float:
     """Return an azimuth (rad) relative to the direction of the camera; positive is to the camera's right."""
-    return azimuth_from_camera(azimuth, calibration.posed_camera, centre)
-
-
-def azimuth_from_camera(azimuth: float, camera: PosedCamera, centre: Float[np.ndarray, "3"]) -> float:
-    """Return the same as `from_the_camera`, where only the camera is known."""
     towards = camera.centre - centre
     if np.hypot(towards[0], towards[1]) < 1e-6 * np.linalg.norm(towards):  # straight from above: below in the picture
         towards = camera.world_from_camera.rotation[:, 1]
@@ -191,7 +186,7 @@ def azimuth_from_camera(azimuth: float, camera: PosedCamera, centre: Float[np.nd
 
 def side_in_words(azimuth: float, calibration: Calibration, centre: Float[np.ndarray, "3"]) -> str:
     """Describe in words where a light of that azimuth (rad) stands, as seen from the camera."""
-    turn = from_the_camera(azimuth, calibration, centre)
+    turn = from_the_camera(azimuth, calibration.posed_camera, centre)
     return SIDES[round(turn / (2 * np.pi) * len(SIDES)) % len(SIDES)]
 
 

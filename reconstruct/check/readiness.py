@@ -125,8 +125,9 @@ def capture_facts(calibration: Calibration, findings: Sequence[Finding], cover: 
     reach = [1.0 if x.position is None else float(np.linalg.norm(x.position - cover.centre)) for x in used]
     sigma = [float(np.linalg.norm(light.sigma)) / distance for light, distance in zip(used, reach, strict=True)]
     kinds = Counter(finding.kind for finding in findings)
+    left_out = {finding.photo.name for finding in findings if finding.drop and finding.role == "lit"}
     return {
-        "photos": len({light.photo for light in calibration.lights} | _left_out(findings)),
+        "photos": len({light.photo for light in calibration.lights} | left_out),
         "photos_used": len({light.photo for light in used}),
         "widest_gap_deg": float(np.degrees(widest_gap(calibration, cover.centre)[1])),
         "lowest_light_deg": float(elevation.min(initial=90.0)),
@@ -142,11 +143,6 @@ def capture_facts(calibration: Calibration, findings: Sequence[Finding], cover: 
         "shadows_cut": int(cover.cut.sum()),
         "findings": dict(sorted(kinds.items())),
     }
-
-
-def _left_out(findings: Sequence[Finding]) -> set[str]:
-    """Return the names of the photos under the flashlight that are left out."""
-    return {finding.photo.name for finding in findings if finding.drop and finding.role == "lit"}
 
 
 MORE_LIGHTS = "Take more photos with the flashlight at other places, camera and focus untouched."

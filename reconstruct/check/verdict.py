@@ -132,9 +132,9 @@ class CaptureCheck:
 
         Azimuths are degrees from the camera's side, positive to its right; elevations are above the ground.
         """
-        lights = []
+        lights, camera = [], self.calibration.posed_camera
         for light, way in zip(self.calibration.lights, directions(self.calibration, self.cover.centre), strict=True):
-            azimuth = from_the_camera(float(np.arctan2(way[1], way[0])), self.calibration, self.cover.centre)
+            azimuth = from_the_camera(float(np.arctan2(way[1], way[0])), camera, self.cover.centre)
             angles = {"azimuth": np.degrees(azimuth), "elevation": np.degrees(np.arcsin(np.clip(way[2], -1, 1)))}
             rounded = {name: round(float(angle), 1) for name, angle in angles.items()}
             lights.append({"photo": light.photo, "used": light.used, "reason": light.reason} | rounded)

@@ -35,10 +35,10 @@ SURE = 255  # stored confidence 1
 MAKE = "remove it and run again."
 LARGEST_SIDE = 2**20  # px, of a photo
 OF_A_VIEW = {
-    "normals": Layout("I16", (None, None, 3), is_needed=False),
-    "albedo": Layout("F16", (None, None, 3), is_needed=False),
-    "confidence": Layout("U8", (None, None), is_needed=False),
-    "world_from_camera": Layout("F64", (4, 4), is_needed=False),
+    "normals": Layout(torch.int16, (None, None, 3), is_needed=False),
+    "albedo": Layout(torch.float16, (None, None, 3), is_needed=False),
+    "confidence": Layout(torch.uint8, (None, None), is_needed=False),
+    "world_from_camera": Layout(torch.float64, (4, 4), is_needed=False),
 }
 LAYOUTS = {
     f"{name}{number}": layout

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
@@ -35,7 +34,7 @@ from reconstruct.evaluate.score import (
     rendered,
 )
 from reconstruct.evaluate.surface_distance import angle_deg, f_score, hidden_from, nmze, register, sample_above
-from reconstruct.stored_run.maps import read_maps
+from reconstruct.stored_run.maps import read_maps, read_mask
 from reconstruct.stored_run.ply import read_mesh
 from reconstruct.stored_run.stored_run import CALIBRATION, MESH
 
@@ -102,7 +101,7 @@ def load_scene_reference(folder: Path) -> Reference:
         PosedCamera(camera, pose, float(_json(truth / "ground.json")["z"])),
         np.load(_existing(truth / "depth.npy")).astype(float).ravel(),
         np.load(_existing(truth / "normal.npy")).astype(float).reshape(-1, 3),
-        _load_mask(truth / "mask.png").ravel(),
+        read_mask(_existing(truth / "mask.png")).ravel(),
         _load_mesh(truth / "mesh.ply"),
     )
 
@@ -270,14 +269,6 @@ def _compare_meshes(
         "fscore_2pct": f_score(precision, recall),
         "chamfer_mm": float((accuracy.mean() + complete.mean()) / 2),
     }
-
-
-def _load_mask(path: Path) -> Bool[np.ndarray, "height width"]:
-    """Load a grey picture as a mask: True where it is brighter than half."""
-    picture = cv2.imread(str(_existing(path)), cv2.IMREAD_GRAYSCALE)
-    if picture is None:
-        raise ReconstructionError(f"{path} is no picture. Make the result again.")
-    return np.asarray(picture) > 127
 
 
 def _load_mesh(path: Path) -> trimesh.Trimesh:

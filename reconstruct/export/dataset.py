@@ -20,6 +20,8 @@ from capture.errors import ReconstructionError
 from capture.files.names import stored_file
 from capture.photos.photo import read_photo
 from reconstruct.fields import SolvedScene
+from reconstruct.render.g_buffer import look
+from reconstruct.render.relight import relight, with_refined_lights
 from reconstruct.stored_run.stored_run import StoredRun
 
 UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")  # in file names of lists that are split at spaces, or on other systems
@@ -65,9 +67,6 @@ class Dataset:
 
     def pictures(self, camera: Camera) -> Iterator[Float[np.ndarray, "height width 3"]]:
         """Yield the picture (linear colour) under each light, as `camera` sees it from the same place."""
-        from reconstruct.render.g_buffer import look
-        from reconstruct.render.relight import relight
-
         if self.photos is not None:
             yield from (_seen_by(camera, self.camera, read_photo(path).rgb) for path in self.photos)
             return
@@ -90,14 +89,11 @@ def open_dataset(run: StoredRun, photos: Path | None = None) -> Dataset:
 
 
 def _of_view(run: StoredRun, photos: Path | None, view: str, calibration: Calibration, fields: SolvedScene) -> Dataset:
-    used = [light for light in calibration.lights if light.used]
+    used = [light for light in with_refined_lights(calibration, fields).lights if light.used]
     if not used:
         raise ReconstructionError(
             f"{run.run_dir} has no light that was used; at least one was needed. Calibrate again."
         )
-    moved = fields.lights
-    if moved is not None and len(moved) == len(used):
-        used = [_moved(light, place) for light, place in zip(used, moved.double().numpy(), strict=True)]
     if photos is None:
         return Dataset(run, tuple(used), fields.camera, None, calibration, fields, view)
     names = [light.photo for light in used]
@@ -168,12 +164,6 @@ def kind_of(lights: tuple[Light, ...], layout: str) -> str:
     if len(kinds) > 1:
         raise ReconstructionError(f"the run has point and directional lights; {layout} needs one kind for all.")
     return kinds.pop()
-
-
-def _moved(light: Light, place: Float[np.ndarray, "4"]) -> Light:
-    if light.kind == "point":
-        return replace(light, position=place[:3].copy()) if light.sigma.any() else light
-    return replace(light, direction=place[:3] / np.linalg.norm(place[:3])) if light.sigma.any() else light
 
 
 def _photo(folder: Path, name: str) -> Path:

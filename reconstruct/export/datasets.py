@@ -22,7 +22,7 @@ from capture.files.atomic import atomic_folder, write_json
 from capture.files.title import file_stem
 from capture.photos.photo import encode_srgb, write_picture
 from reconstruct.export.dataset import Dataset, centred, kind_of, light_matrix, open_dataset, opengl
-from reconstruct.export.export import Contents, ExportOptions, OnProgress
+from reconstruct.export.export import Contents, ExportOptions, OnProgress, reading_back
 from reconstruct.export.solid import ZIP_TIME
 from reconstruct.render.g_buffer import look, surface_maps
 from reconstruct.stored_run.stored_run import StoredRun
@@ -258,19 +258,16 @@ def _zipped(name: str) -> Callable[[StoredRun, Path, ExportOptions, OnProgress],
 shadowneus, rti, colmap, nerf = (_zipped(name) for name in LAYOUTS)
 
 
-def read_archive(run: StoredRun, path: Path) -> Contents:
+def read(run: StoredRun, path: Path) -> Contents:
     """Read back the contents of a zip of a data set.
 
     Raises:
         ReconstructionError: it cannot be read back.
     """
-    try:
-        with zipfile.ZipFile(path) as packed:
-            broken, names = packed.testzip(), packed.namelist()
-    except (OSError, zipfile.BadZipFile) as error:
-        raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
-    if broken is not None:
-        raise ReconstructionError(f"{path.name}: {broken} does not read back. Check the disk, export again.")
+    with reading_back(path), zipfile.ZipFile(path) as packed:
+        names = packed.namelist()
+        if (broken := packed.testzip()) is not None:
+            raise ValueError(f"{broken} is damaged")
     pictures = sum(Path(name).suffix in (".jpg", ".png") for name in names)
     return Contents(note=f"{pictures} pictures, camera and lights")
 

@@ -4,11 +4,16 @@ import importlib
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import ParseError
 
+import cv2
+
+from capture.decode.limits import BrokenFile
 from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_file
 from capture.files.title import file_stem
@@ -17,6 +22,7 @@ from reconstruct.stored_run.stored_run import MESH, StoredRun
 
 UNIT_WORDS = {"mm": "mm", "scene": "units of the scene"}
 MEGABYTE = 1e6
+READ_ERRORS = (OSError, ValueError, LookupError, TypeError, zipfile.BadZipFile, ParseError, cv2.error, BrokenFile)
 
 OnProgress = Callable[[int, int, str], None]  # done, total, what is being done
 
@@ -183,6 +189,20 @@ def save(run_dir: Path, target: Path, write: Callable[[StoredRun, Path], None], 
                 shutil.copyfile(part, temporary)
         size = sum(part.stat().st_size for part in [*parts, draft])
     return FinishedExport(target, tuple(target.parent / part.name for part in parts), size, contents, run.unit)
+
+
+@contextmanager
+def reading_back(path: Path) -> Iterator[None]:
+    """Turn what fails while a file is read that was just written into one sentence.
+
+    Raises:
+        ReconstructionError: it cannot be read back.
+    """
+    try:
+        yield
+    except READ_ERRORS as error:
+        why = error.reason if isinstance(error, BrokenFile) else error
+        raise ReconstructionError(f"{path.name} does not read back ({why}). Check the disk, export again.") from error
 
 
 def _imported(reference: str) -> Any:

@@ -13,7 +13,7 @@ from PIL import Image
 
 from capture.errors import ReconstructionError
 from capture.photos.photo import encode_srgb
-from reconstruct.export.export import Contents, ExportOptions, OnProgress
+from reconstruct.export.export import Contents, ExportOptions, OnProgress, reading_back
 from reconstruct.export.video import FPS, Frames, film_size, write_film
 from reconstruct.render.studio import light_orbit, studio_of, turntable
 from reconstruct.stored_run.stored_run import StoredRun
@@ -43,28 +43,18 @@ def still(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnPro
     Image.fromarray(encode_srgb(picture)).save(path)
 
 
-def read_still(run: StoredRun, path: Path) -> Contents:
-    """Read back the contents of a still.
+def read(run: StoredRun, path: Path) -> Contents:
+    """Read back the contents of a still, or of a video, of which every picture is decoded.
 
     Raises:
         ReconstructionError: it cannot be decoded.
     """
-    try:
-        with Image.open(path) as picture:
-            picture.load()
-            return Contents(pixels=picture.size, note="sRGB")
-    except (OSError, ValueError) as error:
-        raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
-
-
-def read_film(run: StoredRun, path: Path) -> Contents:
-    """Read back the contents of a video, decoding every picture.
-
-    Raises:
-        ReconstructionError: it cannot be decoded.
-    """
-    width, height, frames = film_size(path)
-    return Contents(pixels=(width, height), frames=frames, note=f"{frames / FPS:.1f} s, loops")
+    if path.suffix.lower() != ".png":
+        width, height, frames = film_size(path)
+        return Contents(pixels=(width, height), frames=frames, note=f"{frames / FPS:.1f} s, loops")
+    with reading_back(path), Image.open(path) as picture:
+        picture.load()
+        return Contents(pixels=picture.size, note="sRGB")
 
 
 def checked_width(options: ExportOptions, otherwise: int) -> int:

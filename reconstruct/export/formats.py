@@ -14,27 +14,27 @@ class Format:
     title: str  # for people who do not know the format's name
     about: str  # in one sentence
     writer: str  # "module:function", a reconstruct.export.export.Writer; imported when it is used
-    reader: str  # "module:function", a reconstruct.export.export.Reader
     others: tuple[str, ...] = ()  # further suffixes that the same writer supports
     ending: str = ""  # of the file's name before the suffix, where formats share a suffix
     takes: tuple[str, ...] = ()  # names of the ExportOptions that change the file
 
+    @property
+    def reader(self) -> str:
+        """The function that reads it back, a reconstruct.export.export.Reader: `read` of the writer's module."""
+        return f"{self.writer.partition(':')[0]}:read"
+
 
 _FACES, _PRINTED, _SKINNED = ("faces",), ("faces", "print_size"), ("faces", "texture")
 _LOOK, _MOVES = ("width", "lamp_size"), ("width", "frames", "lamp_size")
-_SOLID, _READ_SOLID = "reconstruct.export.solid", "reconstruct.export.solid:read_solid"
-_SKIN, _READ_SKIN = "reconstruct.export.textured", "reconstruct.export.textured:read_textured"
-_FILM, _READ_FILM = "reconstruct.export.film", "reconstruct.export.film:read_film"
+_SOLID, _SKIN, _MAPS = "reconstruct.export.solid", "reconstruct.export.textured", "reconstruct.export.maps"
+_FILM, _DATA = "reconstruct.export.film", "reconstruct.export.datasets"
 _VIDEO = (".webm", ".gif")
-_DATA, _READ_DATA = "reconstruct.export.datasets", "reconstruct.export.datasets:read_archive"
-_MAPS, _READ_MAP = "reconstruct.export.maps", "reconstruct.export.maps:read_map"
 FORMATS: dict[str, Format] = {
     "glb": Format(
         ".glb",
         "For the web and Blender (GLB)",
         "A light mesh with its colours and fine relief in pictures; metres.",
         f"{_SKIN}:glb",
-        _READ_SKIN,
         takes=_SKINNED,
     ),
     "3mf": Format(
@@ -42,7 +42,6 @@ FORMATS: dict[str, Format] = {
         "For 3D printing (3MF)",
         "A closed solid in millimetres that stands on its base.",
         f"{_SOLID}:threemf",
-        _READ_SOLID,
         takes=_PRINTED,
     ),
     "turntable": Format(
@@ -50,7 +49,6 @@ FORMATS: dict[str, Format] = {
         "A video of the object turning",
         "One full turn on even ground, softly lit; it loops.",
         f"{_FILM}:turn",
-        _READ_FILM,
         _VIDEO,
         "_turn",
         _MOVES,
@@ -60,7 +58,6 @@ FORMATS: dict[str, Format] = {
         "A video of the light going around",
         "From where the photos were taken; it loops.",
         f"{_FILM}:orbit",
-        _READ_FILM,
         _VIDEO,
         "_light",
         _MOVES,
@@ -70,7 +67,6 @@ FORMATS: dict[str, Format] = {
         "A picture of it (PNG)",
         "On even ground, softly lit.",
         f"{_FILM}:still",
-        "reconstruct.export.film:read_still",
         takes=_LOOK,
     ),
     "usdz": Format(
@@ -78,7 +74,6 @@ FORMATS: dict[str, Format] = {
         "For iPhone and iPad (USDZ)",
         "To put on a table by augmented reality.",
         f"{_SKIN}:usdz",
-        _READ_SKIN,
         takes=_SKINNED,
     ),
     "stl": Format(
@@ -86,7 +81,6 @@ FORMATS: dict[str, Format] = {
         "For older 3D printers (STL)",
         "A closed solid; numbers are millimetres.",
         f"{_SOLID}:stl",
-        _READ_SOLID,
         takes=_PRINTED,
     ),
     "obj": Format(
@@ -94,7 +88,6 @@ FORMATS: dict[str, Format] = {
         "For older programs (OBJ)",
         "A light mesh with two pictures, in millimetres.",
         f"{_SKIN}:obj",
-        _READ_SKIN,
         takes=_SKINNED,
     ),
     "ply": Format(
@@ -102,7 +95,6 @@ FORMATS: dict[str, Format] = {
         "Every detail (PLY)",
         "The full mesh, a colour per vertex, what is known of each place.",
         f"{_SOLID}:ply",
-        _READ_SOLID,
         takes=_FACES,
     ),
     "off": Format(
@@ -110,15 +102,13 @@ FORMATS: dict[str, Format] = {
         "For geometry software (OFF)",
         "Corners and triangles as text.",
         f"{_SOLID}:off",
-        _READ_SOLID,
         takes=_FACES,
     ),
     "normal-png": Format(
         ".png",
         "Normals (16-bit PNG)",
         "Which way each pixel faces, with a file that says how to read it.",
-        f"{_MAPS}:normal_png",
-        _READ_MAP,
+        f"{_MAPS}:normals",
         (),
         "_normals",
     ),
@@ -126,8 +116,7 @@ FORMATS: dict[str, Format] = {
         ".png",
         "Depth (16-bit PNG)",
         "How far each pixel is, with a file that says how to read it.",
-        f"{_MAPS}:depth_png",
-        _READ_MAP,
+        f"{_MAPS}:depth",
         (),
         "_depth",
     ),
@@ -135,38 +124,19 @@ FORMATS: dict[str, Format] = {
         ".exr",
         "Normals (EXR)",
         "Which way each pixel faces, as exact numbers.",
-        f"{_MAPS}:normal_exr",
-        _READ_MAP,
+        f"{_MAPS}:normals",
         (),
         "_normals",
     ),
     "shadowneus": Format(
-        ".zip", "ShadowNeuS", "Photos, camera, lights, ground.", f"{_DATA}:shadowneus", _READ_DATA, (), "_shadowneus"
+        ".zip", "ShadowNeuS", "Photos, camera, lights, ground.", f"{_DATA}:shadowneus", (), "_shadowneus"
     ),
-    "rti": Format(".zip", "RTI (relight, OpenLIME)", "Photos, .lp, .dome.", f"{_DATA}:rti", _READ_DATA, (), "_rti"),
-    "colmap": Format(".zip", "COLMAP (text)", "Camera, photos, points.", f"{_DATA}:colmap", _READ_DATA, (), "_colmap"),
-    "nerf": Format(".zip", "NeRF (transforms)", "Photos, camera, light.", f"{_DATA}:nerf", _READ_DATA, (), "_nerf"),
+    "rti": Format(".zip", "RTI (relight, OpenLIME)", "Photos, .lp, .dome.", f"{_DATA}:rti", (), "_rti"),
+    "colmap": Format(".zip", "COLMAP (text)", "Camera, photos, points.", f"{_DATA}:colmap", (), "_colmap"),
+    "nerf": Format(".zip", "NeRF (transforms)", "Photos, camera, light.", f"{_DATA}:nerf", (), "_nerf"),
     "depth-exr": Format(
-        ".exr", "Depth (EXR)", "How far each pixel is, as exact numbers.", f"{_MAPS}:depth_exr", _READ_MAP, (), "_depth"
+        ".exr", "Depth (EXR)", "How far each pixel is, as exact numbers.", f"{_MAPS}:depth", (), "_depth"
     ),
 }
 
-DATASETS = tuple(name for name, row in FORMATS.items() if row.reader == _READ_DATA)  # a folder, or a zip of it
-
-
-def add_format(name: str, row: Format, after: str) -> None:
-    """Insert a row into FORMATS right after the row `after`, or replace the row of that name.
-
-    For packages that import this one and write further kinds of files.
-
-    Raises:
-        KeyError: there is no row `after`.
-    """
-    rows = {key: FORMATS[key] for key in FORMATS if key != name}
-    if after not in rows:
-        raise KeyError(f"{after!r} is none of {', '.join(rows)}")
-    FORMATS.clear()
-    for key, value in rows.items():
-        FORMATS[key] = value
-        if key == after:
-            FORMATS[name] = row
+DATASETS = tuple(name for name, row in FORMATS.items() if row.writer.startswith(_DATA))  # a folder, or a zip of it

@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt16
 
 from capture.decode.exr import read_exr, write_exr
-from capture.decode.limits import BrokenFile
 from capture.errors import ReconstructionError
-from reconstruct.export.export import Contents, ExportOptions, OnProgress
+from reconstruct.export.export import Contents, ExportOptions, OnProgress, reading_back
 from reconstruct.stored_run.maps import DEPTH, NORMALS, read_depth, read_normals
 from reconstruct.stored_run.stored_run import DETAIL, StoredRun
 
@@ -26,61 +25,44 @@ FRAME = "world: right-handed, z up, ground level"
 NORMAL_CODE = "R, G, B = x, y, z of the unit normal: value / 65535 * 2 - 1; 0 0 0 where no object is seen"
 
 
-def normal_png(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
-    """Write world normals, 16 bits per channel; NAME.json describes the coding."""
+def normals(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+    """Write world normals: channels N.X, N.Y, N.Z and A (the object) of an EXR, or 16 bits per channel of a PNG."""
     on_progress(0, 1, "normals")
-    normals = _normals(run)
-    seen = (normals != 0).any(-1)
-    coded = np.where(seen[..., None], np.round((normals + 1) / 2 * FULL), 0).astype(np.uint16)
-    _write_png(path, coded)
-    _write_sidecar(path, _facts(run) | {"content": "normals", "coding": NORMAL_CODE})
+    values = _normals(run)
+    seen = (values != 0).any(-1)
+    if path.suffix.lower() == ".exr":
+        channels = {f"N.{axis}": values[..., i] for i, axis in enumerate("XYZ")} | {"A": seen.astype(np.float32)}
+        write_exr(path, channels, _header(run, "unit normals, 0 where no object is seen"))
+    else:
+        coded = np.where(seen[..., None], np.round((values + 1) / 2 * FULL), 0).astype(np.uint16)
+        _write_png(run, path, coded, {"content": "normals", "coding": NORMAL_CODE})
 
 
-def depth_png(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
-    """Write z-depth along the camera's axis, 16 bits; NAME.json describes the coding."""
+def depth(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+    """Write z-depth along the camera's axis: channels Z and A (the object) of an EXR, or 16 bits of a PNG."""
     on_progress(0, 1, "depth")
-    depth = read_depth(run.run_dir / DEPTH)
-    seen = np.isfinite(depth)
-    near, far = _range(depth, seen)
+    values = read_depth(run.run_dir / DEPTH)
+    seen = np.isfinite(values)
+    if path.suffix.lower() == ".exr":
+        channels = {"Z": np.where(seen, values, 0).astype(np.float32), "A": seen.astype(np.float32)}
+        write_exr(path, channels, _header(run, "z-depth along the camera's axis, 0 where no object is seen"))
+        return
+    near, far = _range(values, seen)
     step = (far - near) / (FARTHEST - NEAREST)
-    coded = np.where(seen, np.round((np.where(seen, depth, near) - near) / step) + NEAREST, NO_DEPTH)
-    _write_png(path, coded.astype(np.uint16))
+    coded = np.where(seen, np.round((np.where(seen, values, near) - near) / step) + NEAREST, NO_DEPTH)
     code = "z-depth = offset + scale * value; value 0: no object is seen"
-    _write_sidecar(
-        path, _facts(run) | {"content": "depth", "coding": code, "scale": step, "offset": near - NEAREST * step}
-    )
+    facts = {"content": "depth", "coding": code, "scale": step, "offset": near - NEAREST * step}
+    _write_png(run, path, coded.astype(np.uint16), facts)
 
 
-def normal_exr(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
-    """Write world normals as channels N.X, N.Y, N.Z and A (the object), 32-bit floats."""
-    on_progress(0, 1, "normals")
-    normals = _normals(run)
-    mask = (normals != 0).any(-1).astype(np.float32)
-    channels = {f"N.{axis}": normals[..., i] for i, axis in enumerate("XYZ")} | {"A": mask}
-    write_exr(path, channels, _header(run, "unit normals, 0 where no object is seen"))
-
-
-def depth_exr(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
-    """Write z-depth as channel Z and A (the object), 32-bit floats."""
-    on_progress(0, 1, "depth")
-    depth = read_depth(run.run_dir / DEPTH)
-    seen = np.isfinite(depth)
-    channels = {"Z": np.where(seen, depth, 0).astype(np.float32), "A": seen.astype(np.float32)}
-    write_exr(path, channels, _header(run, "z-depth along the camera's axis, 0 where no object is seen"))
-
-
-def read_map(run: StoredRun, path: Path) -> Contents:
+def read(run: StoredRun, path: Path) -> Contents:
     """Read back the contents of a map and compare it with the run's own maps.
 
     Raises:
         ReconstructionError: it cannot be read, or differs by more than its quantisation step.
     """
-    try:
+    with reading_back(path):
         is_depth, found = (decode_exr if path.suffix.lower() == ".exr" else decode_png)(path)
-    except BrokenFile as error:
-        raise _unreadable(path, error.reason) from error
-    except (OSError, ValueError, TypeError, KeyError, cv2.error) as error:
-        raise _unreadable(path, error) from error
     wanted = read_depth(run.run_dir / DEPTH) if is_depth else _normals(run)
     there = np.isfinite(wanted) if is_depth else (wanted != 0).any(-1)
     step = float(np.ptp(wanted[there])) / FULL if is_depth else 2 / FULL
@@ -91,10 +73,6 @@ def read_map(run: StoredRun, path: Path) -> Contents:
     low, high = (float(found[there].min()), float(found[there].max())) if is_depth else (-1.0, 1.0)
     said = f"z-depth {low:.4g} to {high:.4g} {unit}" if is_depth else "unit normals, world frame"
     return Contents(pixels=(width, height), note=f"{said}; {int(there.sum()):,} pixels show the object")
-
-
-def _unreadable(path: Path, why: object) -> ReconstructionError:
-    return ReconstructionError(f"{path.name} does not read back ({why}). Check the disk, export again.")
 
 
 def decode_png(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
@@ -167,10 +145,8 @@ def _header(run: StoredRun, content: str) -> dict[str, Any]:
     return {"comments": f"{content}; unit {run.unit}; {FRAME}", "camera": json.dumps(_facts(run))}
 
 
-def _write_png(path: Path, picture: UInt16[np.ndarray, "..."]) -> None:
+def _write_png(run: StoredRun, path: Path, picture: UInt16[np.ndarray, "..."], facts: dict[str, Any]) -> None:
+    """Write a PNG, and NAME.json, which describes the coding."""
     if not cv2.imwrite(str(path), np.ascontiguousarray(picture[..., ::-1]) if picture.ndim == 3 else picture):
         raise ReconstructionError(f"{path.name} could not be written. Check the disk and export again.")
-
-
-def _write_sidecar(path: Path, facts: dict[str, Any]) -> None:
-    path.with_suffix(".json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    path.with_suffix(".json").write_text(json.dumps(_facts(run) | facts, indent=1) + "\n", encoding="utf-8")

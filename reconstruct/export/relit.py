@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -12,14 +12,14 @@ from jaxtyping import Float
 from calibration.calibration import Calibration
 from calibration.light import Light, irradiance
 from capture.decode.exr import exr_size, write_exr
-from capture.decode.limits import BrokenFile
 from capture.decode.panorama import read_panorama
 from capture.errors import ReconstructionError
 from capture.files.title import file_stem
 from capture.photos.photo import encode_srgb
 from reconstruct.detail.fit import with_detail
-from reconstruct.export.export import Contents, ExportOptions, OnProgress
-from reconstruct.export.film import checked_frames, checked_width, read_film, with_progress
+from reconstruct.export.export import Contents, ExportOptions, OnProgress, reading_back
+from reconstruct.export.film import checked_frames, checked_width, with_progress
+from reconstruct.export.film import read as read_film
 from reconstruct.export.video import write_film
 from reconstruct.render.environment import sky_map
 from reconstruct.render.g_buffer import RenderView, look
@@ -98,24 +98,17 @@ def write_relit(run: StoredRun, path: Path, new: NewLight, width: int | None, on
         raise ReconstructionError(f"{path.name} could not be written. Check the disk and try again.")
 
 
-def read_relit(run: StoredRun, path: Path) -> Contents:
+def read(run: StoredRun, path: Path) -> Contents:
     """Read back the contents of a relit picture or video.
 
     Raises:
         ReconstructionError: it cannot be read.
     """
-    if path.suffix.lower() in FILMS:
-        return read_film(run, path)
-    try:
-        if path.suffix.lower() == ".exr":
+    if path.suffix.lower() == ".exr":
+        with reading_back(path):
             return Contents(pixels=exr_size(path), note="linear, 1 = white of the photos")
-        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if picture is None:
-            raise BrokenFile(path, "no picture")
-    except BrokenFile as error:
-        why = f"{path.name} does not read back ({error.reason}). Check the disk, try again."
-        raise ReconstructionError(why) from error
-    return Contents(pixels=(picture.shape[1], picture.shape[0]), note="sRGB, as exposed as the photos")
+    found = read_film(run, path)
+    return found if found.frames else replace(found, note="sRGB, as exposed as the photos")
 
 
 def lamp_at(
@@ -182,11 +175,7 @@ def _under(
     middle, calibration = studio_of(np.asarray(run.mesh.bounds)).centre, run.calibration
     light = lamp_at(calibration, middle, place, new.brightness)
     # relight_soft takes a half angle for a far light: that of a lamp of this size at the usual distance
-    radius = new.radius if light.position is not None else math.atan2(new.radius, usual_distance(run))
+    usual = float(np.linalg.norm(run.fields.posed_camera.centre - middle))  # distance of a lamp given by its direction
+    radius = new.radius if light.position is not None else math.atan2(new.radius, usual)
     samples = samples if radius > 0 else 1
     return relight_soft(view, light, radius, samples, calibration.beam, calibration.ambient).numpy()
-
-
-def usual_distance(run: StoredRun) -> float:
-    """Return the distance from the camera to the object's middle (world), assumed for a lamp given by its direction."""
-    return float(np.linalg.norm(run.fields.posed_camera.centre - studio_of(np.asarray(run.mesh.bounds)).centre))

@@ -13,7 +13,7 @@ import trimesh
 from capture.errors import ReconstructionError
 from capture.files.regular import read_regular
 from reconstruct.export.edited import edit_of, edited_surface, edits_in_words
-from reconstruct.export.export import Contents, ExportOptions, OnProgress
+from reconstruct.export.export import Contents, ExportOptions, OnProgress, reading_back
 from reconstruct.mesh.edit import Edit
 from reconstruct.mesh.simplify import bounds_a_solid
 from reconstruct.stored_run.ply import LARGEST_FILE
@@ -25,7 +25,6 @@ CONTENT_TYPES = "http://schemas.openxmlformats.org/package/2006/content-types"
 MODEL_PART = "3D/3dmodel.model"
 ZIP_TIME = (1980, 1, 1, 0, 0, 0)  # the same run gives the same bytes
 SMALLEST_PRINT, LARGEST_PRINT = 1.0, 10_000.0  # mm, of the longest side
-READ_ERRORS = (OSError, ValueError, IndexError, KeyError, zipfile.BadZipFile, ElementTree.ParseError)
 
 
 def ply(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
@@ -84,18 +83,16 @@ def threemf(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnP
             archive.writestr(zipfile.ZipInfo(name, ZIP_TIME), text, zipfile.ZIP_DEFLATED)
 
 
-def read_solid(run: StoredRun, path: Path) -> Contents:
+def read(run: StoredRun, path: Path) -> Contents:
     """Read back the contents of a mesh file.
 
     Raises:
         ReconstructionError: it cannot be read, or does not bound a solid although nothing was cut away.
     """
-    try:
+    with reading_back(path):
         mesh = _read_3mf(path) if path.suffix.lower() == ".3mf" else trimesh.load_mesh(path, process=False)
         extents = tuple(float(e) for e in mesh.extents)
         is_closed = bounds_a_solid(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-    except READ_ERRORS as error:
-        raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
     edits = edits_in_words(run)
     if not is_closed and not edit_of(run).cuts_guess:
         raise ReconstructionError(

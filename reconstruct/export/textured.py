@@ -4,7 +4,6 @@ Writers raise ReconstructionError if the mesh cannot be read or reduced, OSError
 """
 
 import io
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from PIL import Image
 
 from capture.errors import ReconstructionError
 from reconstruct.export.edited import edit_of, edited_surface, edits_in_words
-from reconstruct.export.export import Contents, ExportOptions, OnProgress
+from reconstruct.export.export import Contents, ExportOptions, OnProgress, reading_back
 from reconstruct.mesh.glb import write_textured_glb
 from reconstruct.mesh.mesh import MM_PER_METRE
 from reconstruct.mesh.simplify import bounds_a_solid
@@ -28,7 +27,6 @@ USUAL_TEXTURE = 1024  # px, both sides: about two texels per voxel on most objec
 LARGEST_UNASKED = 4096  # px: some 30 MB of pictures; what a phone still loads
 TEXTURE_STEP = 256  # px
 STEPS = 3
-READ_ERRORS = (OSError, ValueError, IndexError, KeyError, TypeError, zipfile.BadZipFile)
 
 
 def glb(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
@@ -96,16 +94,18 @@ def standing(vertices: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return vertices - np.append(0.5 * (low + high)[:2], low[2])
 
 
-def read_textured(run: StoredRun, path: Path) -> Contents:
+def read(run: StoredRun, path: Path) -> Contents:
     """Read back the contents of a textured mesh.
 
     Raises:
         ReconstructionError: it or its pictures cannot be read, or it does not bound a solid.
     """
-    try:
-        vertices, faces, size = _read_usdz(path) if path.suffix.lower() == ".usdz" else _read_mesh(path)
-    except READ_ERRORS as error:
-        raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
+    with reading_back(path):
+        if path.suffix.lower() == ".usdz":
+            from reconstruct.mesh.usd import read_usdz as read_file
+        else:
+            read_file = _read_mesh
+        vertices, faces, size = read_file(path)
     if not bounds_a_solid(vertices, faces) and not edit_of(run).cuts_guess:
         raise ReconstructionError(
             f"{path.name} reads back as {len(faces)} triangles that leave holes, and a closed surface was needed. "
@@ -140,12 +140,6 @@ def _read_mesh(path: Path) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, int]:
         raise ValueError("it has no picture")
     picture.load()
     return np.asarray(mesh.vertices), np.asarray(mesh.faces), picture.width
-
-
-def _read_usdz(path: Path) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, int]:
-    from reconstruct.mesh.usd import read_usdz
-
-    return read_usdz(path)
 
 
 def _baked(run: StoredRun, options: ExportOptions, on_progress: OnProgress) -> TexturedMesh:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 
 import cv2
@@ -23,7 +24,7 @@ def write_film(path: Path, frames: Frames) -> None:
     """Write the pictures as a video, by the file's ending: .mp4 (H.264, needs the extra `video`), .webm (VP9), .gif.
 
     Args:
-        frames: of one size, whose sides are even.
+        frames: one or more of one size, whose sides are even.
 
     Raises:
         ReconstructionError: another ending, or the package for .mp4 is not installed.
@@ -72,35 +73,30 @@ def _write_mp4(path: Path, frames: Iterator[UInt8[np.ndarray, "height width 3"]]
         )
     import av
 
+    first = next(frames)
     with av.open(str(path), "w", options={"movflags": "+faststart"}) as container:
-        stream = None
-        for frame in frames:
-            if stream is None:
-                stream = container.add_stream("libx264", FPS, options={"crf": H264_QUALITY, "preset": "medium"})
-                stream.height, stream.width = frame.shape[:2]
-                stream.pix_fmt = "yuv420p"
-                stream.time_base = Fraction(1, FPS)
-                context = stream.codec_context
-                context.color_range, context.colorspace = 1, 1  # 16..235, BT.709
-                context.color_primaries = context.color_trc = 1
+        stream = container.add_stream("libx264", FPS, options={"crf": H264_QUALITY, "preset": "medium"})
+        stream.height, stream.width = first.shape[:2]
+        stream.pix_fmt = "yuv420p"
+        stream.time_base = Fraction(1, FPS)
+        context = stream.codec_context
+        context.color_range, context.colorspace = 1, 1  # 16..235, BT.709
+        context.color_primaries = context.color_trc = 1
+        for frame in chain([first], frames):
             picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
             container.mux(stream.encode(picture.reformat(format="yuv420p", dst_colorspace="ITU709")))
-        if stream is not None:
-            container.mux(stream.encode())
+        container.mux(stream.encode())
 
 
 def _write_webm(path: Path, frames: Iterator[UInt8[np.ndarray, "height width 3"]]) -> None:
     """Write VP9 with OpenCV's encoder."""
-    writer = None
-    for frame in frames:
-        if writer is None:
-            size = (frame.shape[1], frame.shape[0])
-            writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP90"), FPS, size)
-            if not writer.isOpened():
-                raise ReconstructionError(f"{path.name}: this OpenCV writes no WebM. Choose .gif or .mp4.")
+    first = next(frames)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP90"), FPS, (first.shape[1], first.shape[0]))
+    if not writer.isOpened():
+        raise ReconstructionError(f"{path.name}: this OpenCV writes no WebM. Choose .gif or .mp4.")
+    for frame in chain([first], frames):
         writer.write(np.ascontiguousarray(frame[..., ::-1]))
-    if writer is not None:
-        writer.release()
+    writer.release()
 
 
 def _write_gif(path: Path, frames: Iterator[UInt8[np.ndarray, "height width 3"]]) -> None:

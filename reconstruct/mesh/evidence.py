@@ -70,7 +70,9 @@ def vertex_evidence(fields: SolvedScene, vertices: Float[np.ndarray, "n 3"]) -> 
         facing.append(((away * normals).sum(1) / away.norm(dim=1)).abs().double().numpy())
         points = torch.from_numpy(own).float()
         in_sight = in_line_of_sight(view.grid, eye, points, SEEN_WITHIN * grid.spacing).numpy()
-        sights.append(in_sight & _in_picture(view, own))
+        u, v = view.posed_camera.project(own).T
+        last = view.camera.width - 1, view.camera.height - 1
+        sights.append(in_sight & (np.abs(u / last[0] - 0.5) <= 0.5) & (np.abs(v / last[1] - 0.5) <= 0.5))
         footprints.append((points - eye).norm(dim=1).double().numpy() / view.camera.fx)
     seen, nearest = np.any(sights, axis=0), np.min(footprints, axis=0)
     footprint = np.where(seen, np.where(sights, footprints, np.inf).min(axis=0), nearest)
@@ -139,8 +141,3 @@ def _distance_by_cells(
     is_chosen = np.zeros(len(means), bool)
     is_chosen[cell[chosen]] = True
     return _distance_to(is_chosen, means, farthest)[cell]
-
-
-def _in_picture(fields: SolvedScene, vertices: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    u, v = fields.posed_camera.project(vertices).T
-    return (np.abs(u / (fields.camera.width - 1) - 0.5) <= 0.5) & (np.abs(v / (fields.camera.height - 1) - 0.5) <= 0.5)

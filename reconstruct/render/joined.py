@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from reconstruct.appearance.brdf import Gloss
-from reconstruct.fields import FurtherView, SolvedScene
+from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import MIN_FACING, SAME_DEPTH, SurfaceMaps, away_from_outlines, finite, surface_maps
 
 FEATHER = 0.06  # of the object's size in the picture: its weight grows so far from the outline, where seams would be
@@ -75,7 +75,7 @@ def join_views(views: Sequence[SolvedScene]) -> SolvedScene:
     albedos = [torch.from_numpy(picture[..., :3]) for picture in pictures]
     weights = [torch.from_numpy(picture[..., 3:]) if lobes is not None else None for picture in pictures]
     further = tuple(
-        FurtherView(view.view, albedo, view.camera, view.world_from_camera, view.lights, weight, view.object_from_world)
+        replace(view.cameras[0], albedo=albedo, gloss_weights=weight)
         for view, albedo, weight in zip(views[1:], albedos[1:], weights[1:], strict=True)
     )
     gloss = None if lobes is None or weights[0] is None else Gloss(lobes, weights[0])

@@ -283,6 +283,8 @@ def with_refined_lights(calibration: Calibration, fields: SolvedScene) -> Calibr
         return calibration
     lights = list(calibration.lights)
     for i, now in zip(used, fields.lights.double().numpy()[:, :3], strict=True):
+        if not lights[i].sigma.any():
+            continue  # it is known, and stays as it is stored
         is_point = lights[i].position is not None
         lights[i] = replace(lights[i], **{"position": now} if is_point else {"direction": now / np.linalg.norm(now)})
     return replace(calibration, lights=tuple(lights))

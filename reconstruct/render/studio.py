@@ -11,7 +11,7 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from reconstruct.fields import SolvedScene
-from reconstruct.render.g_buffer import RenderView, SeenMaterial, look, seen_material
+from reconstruct.render.g_buffer import RenderView, look, seen_material
 from reconstruct.render.relight import relight_soft
 
 FILL = 1.05  # diameter of the bounding sphere over the picture's height: most objects fill two thirds of their sphere
@@ -103,7 +103,11 @@ def turntable(
     samples: int = LAMP_SAMPLES,
 ) -> Iterator[Float[np.ndarray, "height width 3"]]:
     """Yield linear pictures of one full turn of the object before fixed camera and lamp; the sequence loops."""
-    material = even_ground(seen_material(fields))
+    material = seen_material(fields)
+    ground = material.ground_albedo
+    mean = ground.mean(0, keepdims=True) if len(ground) else np.full((1, 3), 0.5, np.float32)
+    # The photo shows only a part of the ground, so all of it gets the mean of what is seen.
+    material = replace(material, ground_points=np.zeros((1, 3), np.float32), ground_albedo=mean)
     first = direction_of(fields.posed_camera.centre - studio.centre)[0]
     for k in range(frames):
         turn = 2 * np.pi * k / frames
@@ -121,13 +125,6 @@ def light_orbit(
     first = direction_of(fields.posed_camera.centre - studio.centre)[0]
     for k in range(frames):
         yield lit(view, key_light(studio, first + KEY_TURN + 2 * np.pi * k / frames), studio, lamp_size)
-
-
-def even_ground(material: SeenMaterial) -> SeenMaterial:
-    """Give the ground one albedo, the mean of its seen points, because the photo shows only a part of it."""
-    seen = material.ground_albedo
-    mean = seen.mean(0, keepdims=True) if len(seen) else np.full((1, 3), 0.5, np.float32)
-    return replace(material, ground_points=np.zeros((1, 3), np.float32), ground_albedo=mean)
 
 
 def even(size: int) -> int:

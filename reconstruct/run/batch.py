@@ -267,16 +267,13 @@ def on_ray(tasks: Sequence[Task], address: str) -> Iterator[Outcome]:
             try:
                 yield ray.get(done)
             except ray.exceptions.RayError as error:
-                yield _lost(task, error)
+                said = (
+                    f"the cluster lost it {RAY_RETRIES + 1} times ({type(error).__name__}). Started again, it goes on."
+                )
+                yield Outcome(task.name, task.capture, task.options, 1, said, 0.0, time.time())
     finally:
         if started_here:
             ray.shutdown()
-
-
-def _lost(task: Task, error: Exception) -> Outcome:
-    """Return the outcome of a task that the cluster could not finish."""
-    sentence = f"the cluster lost it {RAY_RETRIES + 1} times ({type(error).__name__}). Started again, it goes on."
-    return Outcome(task.name, task.capture, task.options, 1, sentence, 0.0, time.time())
 
 
 Engine = Callable[[Sequence[Task]], Iterator[Outcome]]

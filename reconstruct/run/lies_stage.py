@@ -1,8 +1,7 @@
 """Part of stage "solve" for an object that was laid anew: each lie solved small on its own, then all laid together."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import count
-from pathlib import Path
 
 import torch
 
@@ -38,55 +37,10 @@ def joined_lies(
     """
     if not (lies and scenes[0].ground_known):
         return scenes, None, ()
-    together = lay_lies_together(scenes, lies, config.seed, run, report, device)
+    together = _SmallSolves(run, report, device, config.seed).laid_together(scenes, lies)
     scenes, doubts = joined_scenes(scenes, lies, together.placed), tuple(text for _, text in together.refused)
     start = begun(together.start, min(1, len(config.levels) - 1), scenes) if together.placed else None
     return scenes, start, doubts
-
-
-def lay_lies_together(
-    scenes: Scenes, lies: Lies, seed: int, run: RunFolder, report: SolveReporter, device: torch.device | None
-) -> Together:
-    """Solve the first lie's scenes and each further lie's small, and find how these lie in the world of the first.
-
-    What was solved is kept in the run folder, so that a run that was stopped does not repeat it. A lie that cannot be
-    solved or placed is named in the result's `refused`; if it was solved, its own mesh is written.
-
-    Raises:
-        ReconstructionError: the first lie cannot be solved.
-        OSError: a file cannot be written.
-    """
-    solved, refused = [], []
-    for number, (name, own) in enumerate((("", scenes), *lies)):
-        small = tuple(reduced(scene, LONG_SIDES[SMALL]) for scene in own)
-        path = run.file(f"{KEPT_LIE}_{number}.safetensors")
-        try:
-            alone = _solved_small(withheld(small, seed), name, seed, path, report, run, device)
-        except ReconstructionError as error:
-            if not name:
-                raise
-            refused.append((name, f"{name} is left out: {error}"))
-            continue
-        solved.append(SolvedLie(name, small, alone))
-    together = lay_together(tuple(solved), seed, run.activity)
-    for one in together.placed:
-        run.progress(message=one.sentence())
-
-    attempts = count()
-
-    def solve(placed: tuple[PlacedLie, ...], start: SdfGrid) -> SdfGrid:
-        path = run.file(f"{KEPT_LIE}_all_{next(attempts)}.safetensors")
-        return _solved_together(solved, placed, start, seed, path, report, run, device)
-
-    together = confirmed(solved, together, solve, seed, lambda text: run.progress(message=text))
-    for name, sentence in together.refused:
-        refused.append((name, f"{sentence} What it shows is left out; its own surface is in {name}/{NOT_JOINED}."))
-        alone = next(one.fields for one in solved if one.name == name)
-        with run.writing(f"{name}/{NOT_JOINED}") as mesh:
-            extract_mesh(alone).export(mesh, file_type="ply")
-    for _, sentence in refused:
-        run.progress(message=sentence)
-    return replace(together, refused=tuple(refused))
 
 
 def joined_scenes(scenes: Scenes, lies: Lies, placed: tuple[PlacedLie, ...]) -> Scenes:
@@ -102,43 +56,71 @@ def forget_lies(run: RunFolder) -> None:
         run.discard(path.name)
 
 
-def _solved_small(
-    scenes: Scenes,
-    name: str,
-    seed: int,
-    path: Path,
-    report: SolveReporter,
-    run: RunFolder,
-    device: torch.device | None,
-) -> SolvedScene:
-    """Return a lie's own solve, from its file if there is one."""
-    if path.is_file():
-        return load_fields(path)
-    _, config = preset(SMALL, seed)
-    called = f"{name or 'the first lie'}, small"
-    found = fit(
-        scenes, config, _part(called, report), device=device, say=lambda text: run.activity(f"{called}: {text}")
-    )
-    save_fields(found, path)
-    return found
+@dataclass(frozen=True)
+class _SmallSolves:
+    """Small solves of lies, kept in the run folder, so that a run that was stopped does not repeat them."""
 
+    run: RunFolder
+    report: SolveReporter
+    device: torch.device | None
+    seed: int
 
-def _solved_together(
-    solved: list[SolvedLie],
-    placed: tuple[PlacedLie, ...],
-    start: SdfGrid,
-    seed: int,
-    path: Path,
-    report: SolveReporter,
-    run: RunFolder,
-    device: torch.device | None,
-) -> SdfGrid:
-    """Return the small surface of the first lie and those that were placed, see withheld; no trial of lights."""
-    lies = tuple((one.name, withheld(one.scenes, seed)) for one in solved)
-    scenes = joined_scenes(lies[0][1], lies[1:], placed)
-    _, config = preset(SMALL, seed)
-    earlier = begun(start, len(config.levels) - 1, scenes)
-    return fit_surface(scenes, config, _part("all lies, small", report), path, device, earlier, run.activity)
+    def laid_together(self, scenes: Scenes, lies: Lies) -> Together:
+        """Solve the first lie's scenes and each further lie's, and find how these lie in the world of the first.
+
+        A lie that cannot be solved or placed is named in the result's `refused`; if it was solved, its own mesh is
+        written.
+
+        Raises:
+            ReconstructionError: the first lie cannot be solved.
+            OSError: a file cannot be written.
+        """
+        solved, refused = [], []
+        for number, (name, own) in enumerate((("", scenes), *lies)):
+            small = tuple(reduced(scene, LONG_SIDES[SMALL]) for scene in own)
+            try:
+                solved.append(SolvedLie(name, small, self._alone(withheld(small, self.seed), name, number)))
+            except ReconstructionError as error:
+                if not name:
+                    raise
+                refused.append((name, f"{name} is left out: {error}"))
+        together = lay_together(tuple(solved), self.seed, self.run.activity)
+        for one in together.placed:
+            self.run.progress(message=one.sentence())
+        known = tuple((one.name, withheld(one.scenes, self.seed)) for one in solved)
+        attempts = count()
+
+        def solve(placed: tuple[PlacedLie, ...], start: SdfGrid) -> SdfGrid:
+            return self._all(joined_scenes(known[0][1], known[1:], placed), start, next(attempts))
+
+        together = confirmed(solved, together, solve, self.seed, lambda text: self.run.progress(message=text))
+        for name, sentence in together.refused:
+            refused.append((name, f"{sentence} What it shows is left out; its own surface is in {name}/{NOT_JOINED}."))
+            alone = next(one.fields for one in solved if one.name == name)
+            with self.run.writing(f"{name}/{NOT_JOINED}") as mesh:
+                extract_mesh(alone).export(mesh, file_type="ply")
+        for _, sentence in refused:
+            self.run.progress(message=sentence)
+        return replace(together, refused=tuple(refused))
+
+    def _alone(self, scenes: Scenes, name: str, number: int) -> SolvedScene:
+        """Return a lie's own solve, from its file if there is one."""
+        path = self.run.file(f"{KEPT_LIE}_{number}.safetensors")
+        if path.is_file():
+            return load_fields(path)
+        _, config = preset(SMALL, self.seed)
+        called = f"{name or 'the first lie'}, small"
+        say = lambda text: self.run.activity(f"{called}: {text}")  # noqa: E731
+        found = fit(scenes, config, _part(called, self.report), device=self.device, say=say)
+        save_fields(found, path)
+        return found
+
+    def _all(self, scenes: Scenes, start: SdfGrid, attempt: int) -> SdfGrid:
+        """Return the small surface of the first lie and those that were placed; no trial of lights."""
+        _, config = preset(SMALL, self.seed)
+        path = self.run.file(f"{KEPT_LIE}_all_{attempt}.safetensors")
+        earlier, part = begun(start, len(config.levels) - 1, scenes), _part("all lies, small", self.report)
+        return fit_surface(scenes, config, part, path, self.device, earlier, self.run.activity)
 
 
 def _part(called: str, report: SolveReporter) -> SolveReporter:

@@ -41,7 +41,6 @@ HULL_S, LABELS_S = 3.5, 0.5e-6  # of a run; a pixel of the solver's pictures, an
 MESH_S, DETAIL_S, REPORT_S = 4e-5, 0.03, 1.5  # a squared node; a photo and a megapixel; of a run
 COMPILING_S = 18.0  # of the first run on a machine
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-OPTIONAL = {"playwright": "browser tests"}
 GIB = 2**30
 FEWEST_SHARE = 0.25
 SIDES_RATIO = 0.75  # of a photo's sides
@@ -167,31 +166,26 @@ def predicted_runs(photos: int, width: int, height: int) -> list[dict[str, str |
 def describe_machine() -> list[str]:
     """Return the lines of the report of `shadowgraph doctor`."""
     memory = psutil.virtual_memory()
+    accelerator = f"{torch.cuda.get_device_name()} found" if torch.cuda.is_available() else "no GPU found, none needed"
+    compiled = "kept" if kernels_are_compiled() else "none yet; the first run takes some 20 s longer"
     lines = [
         f"Python {platform.python_version()} on {platform.platform()}",
         f"cores: {os.cpu_count()}, used: {thread_count()}",
         f"memory: {memory.total / GIB:.1f} GiB, free {memory.available / GIB:.1f} GiB",
         f"photos are decoded: {confinement()}",
-        f"torch {torch.__version__}: {_accelerator()}",
+        f"torch {torch.__version__}: {accelerator}",
         f"the surface is fitted on: {backend_name(solver_device('auto'))}",
-        f"compiled parts: {_cache_state()}",
+        f"compiled parts: {compiled} ({_cache_folder()})",
         f"browser for the tests: {next(filter(shutil.which, BROWSERS), 'none found; those tests are skipped')}",
     ]
-    for module, use in OPTIONAL.items():
-        has = importlib.util.find_spec(module) is not None
-        lines.append(f"{module} ({use}): {'installed' if has else 'not installed, optional'}")
+    has = importlib.util.find_spec("playwright") is not None
+    lines.append(f"playwright (browser tests): {'installed' if has else 'not installed, optional'}")
     for row in predicted_runs(36, 4032, 3024):
         seconds, memory = duration_text(float(row["seconds"])), f"{float(row['bytes']) / GIB:.1f} GiB of memory"
         lines.append(
             f"36 photos of 12 megapixels, --preset {row['name']}: about {seconds} as busy as it is now, {memory}"
         )
     return lines
-
-
-def _accelerator() -> str:
-    if torch.cuda.is_available():
-        return f"{torch.cuda.get_device_name()} found"
-    return "no GPU found, none needed"
 
 
 def kernels_are_compiled() -> bool:
@@ -202,9 +196,3 @@ def kernels_are_compiled() -> bool:
 
 def _cache_folder() -> Path:
     return Path(os.environ.get("NUMBA_CACHE_DIR") or Path(kernels.__file__).parent / "__pycache__")
-
-
-def _cache_state() -> str:
-    if kernels_are_compiled():
-        return f"kept in {_cache_folder()}"
-    return f"none yet; the first run compiles them and takes some 20 s longer ({_cache_folder()})"

@@ -40,13 +40,14 @@ from reconstruct.run.results import detail_is_asked, save_results, write_detail
 from reconstruct.run.solve_stage import solve
 from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder, content_hash
 from reconstruct.run_folder.forecast import duration_text, plan_numbers
-from reconstruct.run_folder.once import Lazy, ResultFile, done_once, once
+from reconstruct.run_folder.once import Lazy, once
 from reconstruct.run_folder.progress import log_to
 from reconstruct.solve.backend import backend_name, solver_device
 from reconstruct.source.calibrate_source import calibrate_source, in_millimetres, with_scale_of
 from reconstruct.source.photos import Photos, Plan, keep_spread, memory_plan, read_photos, read_plan
 from reconstruct.source.source import RunOptions, Source
 from reconstruct.stored_run.maps import THUMBS, thumbnail_name
+from reconstruct.stored_run.stored_run import CALIBRATION, FIELDS
 
 THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows
 THUMBNAIL_QUALITY = 88  # JPEG: artefacts do not show at this size
@@ -54,9 +55,6 @@ KEPT_PER_PIXEL = 13  # bytes of each photo kept: three float32 and a flag
 ADDED_LATER = ("detail",)  # options that can be added to a finished run: they leave its existing results unchanged
 CALIBRATING = ("capture", "calibrate")  # stages of `shadowgraph calibrate`
 CALIBRATION_OPTIONS = ("board", "input", "lights", "split", "light_error", "ground")
-
-CALIBRATION = ResultFile("calibration.json", save_views, load_views)
-FIELDS = ResultFile("fields.safetensors", save_fields, load_fields)
 
 
 def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str) -> None:
@@ -75,34 +73,32 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
         run.progress("capture", message=f"forgotten, as the run starts anew: {', '.join(sorted(run.forgotten))}")
     _plan_time(source, options, run, stages)
     photos = Lazy(lambda: _read(source, options, run))
-    calibrated = once(
-        run,
-        "calibrate",
-        "finding camera, ground and lights",
-        lambda: _calibrated(source, photos.get(), options, run),
-        CALIBRATION,
-        photos,
-    )
+    calibrated = Lazy(lambda: load_views(run.file(CALIBRATION)))
+    fields = Lazy(lambda: load_fields(run.file(FIELDS)))
+    mesh = Lazy(lambda: extract_mesh(fields.get()))
+
+    def calibrate() -> None:
+        save_views(_calibrated(source, photos.get(), options, run), run.file(CALIBRATION))
+
+    def fit() -> None:
+        save_fields(_solved(source, photos, calibrated.get(), options, run), run.file(FIELDS))
+
+    once(run, "calibrate", "finding camera, ground and lights", calibrate, photos, CALIBRATION)
     if stages == "calibrate":
         return
     if source.session is not None and source.ground_is_known(options) and not run.is_finished("solve"):
-        done_once(
-            run, "check", "judging the photos", lambda: _check(source, photos.get(), calibrated.get(), run), photos
-        )
-    fields = once(
-        run, "solve", _fitting(options), lambda: _solved(source, photos, calibrated.get(), options, run), FIELDS, photos
-    )
+        once(run, "check", "judging the photos", lambda: _check(source, photos.get(), calibrated.get(), run), photos)
+    once(run, "solve", _fitting(options), fit, photos, FIELDS)
     if source.scale(options) is not None and run.is_finished("solve"):
         _keep_scale(source, options, run, calibrated.get(), fields.get())
     calibrated.forget()  # the memory plan may have left out photos
-    mesh = Lazy(lambda: extract_mesh(fields.get()))
-    is_new = done_once(
+    is_new = once(
         run, "mesh", "making the mesh", lambda: save_results(mesh.get(), fields.get(), calibrated.get(), run.path)
     )
     if detail_is_asked(source, options):
         message = "reading relief and colours from the whole photos"
         do = lambda: write_detail(source, options, run, photos.get(), calibrated.get(), fields.get())  # noqa: E731
-        is_new |= done_once(run, "detail", message, do, photos)
+        is_new |= once(run, "detail", message, do, photos)
     if run.is_finished("solve"):  # a visitor of the page may have stopped it: then the same command goes on
         run.discard(KEPT)
     if is_new or not run.file("report.json").exists():  # a kill may come between them
@@ -183,7 +179,7 @@ def _keep_scale(
     if length is not None and calibrated.first.unit != fields.unit:
         known = source.ground_is_known(options)
         scaled = [with_scale_of(view.calibration, fields, length, known) for view in calibrated.views]
-        save_views(calibrated.with_calibrations(scaled), run.file("calibration.json"))
+        save_views(calibrated.with_calibrations(scaled), run.file(CALIBRATION))
 
 
 def _fitting(options: RunOptions) -> str:
@@ -215,7 +211,7 @@ def _within_memory(source: Source, options: RunOptions, run: RunFolder, calibrat
     if used[0] == used[1]:
         return calibrated
     calibrated = calibrated.with_calibrations(thinned)
-    save_views(calibrated, run.file("calibration.json"))
+    save_views(calibrated, run.file(CALIBRATION))
     return calibrated
 
 
@@ -237,15 +233,6 @@ def claim(source: Source, options: RunOptions, run: RunFolder, stages: str, forc
     hashes = content_hash(source.files(options))
     run.claim(hashes, {name: getattr(options, name) for name in names}, force, made_with)
     hand_title_on(source.folder, run.path)
-
-
-def refuse_device(options: RunOptions) -> None:
-    """Check that --device exists, before anything is read or written.
-
-    Raises:
-        ReconstructionError: the device is "cuda", and torch finds none.
-    """
-    solver_device(options.device)
 
 
 def write_thumbnails(source: Source, run: RunFolder, first: str | None = None) -> None:

@@ -4,7 +4,6 @@ A job is a batch's Task with a state, kept in a file that is written whole after
 go on while nobody looks. After its next start a queue finds out from process ids, locks and logs what became of them.
 """
 
-import contextlib
 import secrets
 import subprocess
 import threading
@@ -23,13 +22,12 @@ from capture.files.atomic import read_json, write_json
 from capture.files.schema import Count, Number, Text, as_type
 from reconstruct.run.batch import PROGRAM, Task, log_file, start_task, why_it_failed
 from reconstruct.run_folder.folder import LOG, read_log
-from reconstruct.run_folder.lock import LOCK, lock_holder
+from reconstruct.run_folder.lock import LOCK, lock_holder, running
 
 FORMAT = 1
 WAITING, RUNNING, FINISHED, FAILED, STOPPED = "waiting", "running", "finished", "failed", "stopped"
 MOST_KEPT = 500  # jobs that are over
 STOPPED_CODES = (130, 143)  # Ctrl-C, SIGTERM: the run saved its state
-SAME_START_S = 1.0  # ids are reused: the same id with another start time is another process
 
 
 @dataclass(frozen=True)
@@ -125,8 +123,9 @@ class Queue:
                 stopped = replace(job, state=STOPPED, ended=time.time())
                 self._write([stopped if other is job else other for other in self._jobs])
             elif job.state == RUNNING:
-                with contextlib.suppress(psutil.Error):
-                    _process(job).terminate()
+                process = running(job.pid, job.started)
+                if process is not None:
+                    process.terminate()
 
     def first(self, id_: str) -> None:
         """Move a job that waits before all others that wait."""
@@ -189,7 +188,7 @@ class Queue:
     def _look_after(self, job: Job) -> None:
         child = self._children.get(job.id)
         code = None if child is None else child.poll()
-        if code is None and (child is not None or _is_alive(job)):
+        if code is None and (child is not None or running(job.pid, job.started) is not None):
             return
         self._children.pop(job.id, None)
         state, sentence = _end_of(job, code)
@@ -235,26 +234,6 @@ def _end_of(job: Job, code: int | None) -> tuple[str, str]:
         return FAILED, why_it_failed(code, log_file(job.task))
     except OSError:
         return FAILED, "its output is gone. Start it again."
-
-
-def _process(job: Job) -> psutil.Process:
-    """Return the process of a job.
-
-    Raises:
-        psutil.Error: it is gone.
-    """
-    process = psutil.Process(job.pid)
-    if abs(process.create_time() - job.started) > SAME_START_S or process.status() == psutil.STATUS_ZOMBIE:
-        raise psutil.NoSuchProcess(job.pid)
-    return process
-
-
-def _is_alive(job: Job) -> bool:
-    try:
-        _process(job)
-    except psutil.Error:
-        return False
-    return True
 
 
 def _row(task: Task) -> dict[str, object]:

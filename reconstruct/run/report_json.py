@@ -4,7 +4,7 @@ import platform
 import shlex
 from dataclasses import asdict, fields
 from importlib import metadata
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -12,14 +12,13 @@ import trimesh
 from calibration.board.board_scale import scale_sentence
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
+from reconstruct.fields import SolvedScene
+from reconstruct.mesh.evidence import KINDS, UNCONSTRAINED, volume_sigma
 from reconstruct.run_folder.folder import LOG, PLAN, RunFolder, read_log
 from reconstruct.run_folder.requests import ON_REQUEST
 from reconstruct.source.photos import OVERRIDE, read_plan
 from reconstruct.source.source import RunOptions, Source
 from reconstruct.stored_run.documents import CHECK, read_check
-
-if TYPE_CHECKING:
-    from reconstruct.fields import SolvedScene
 
 NAMES = ("shadowgraph", "numpy", "torch", "numba", "opencv-contrib-python-headless", "trimesh", "viser")
 MISFIT = 0.1  # of held-out shadow rays: captures with right lights leave .002 to .05
@@ -38,11 +37,11 @@ def summary(
     run: RunFolder,
     calibrated: CalibratedViews,
     mesh: trimesh.Trimesh,
-    solved: "SolvedScene",
+    solved: SolvedScene,
 ) -> dict[str, Any]:
     """Return the content of report.json: costs, photos used and dropped, residuals, versions."""
-    calibration = calibrated.first
-    residuals = plain(calibration.residuals)
+    calibration, check, plan = calibrated.first, run.file(CHECK), read_plan(run.file(PLAN))
+    residuals, trial = plain(calibration.residuals), solved.light_trial
     views = {view.name: view.calibration for view in calibrated.every()}
     notes, warnings = (_said(calibrated, key) for key in ("notes", "warnings"))
     names = {calibrated.views[0].name, *(view.view for view in solved.views())}
@@ -67,8 +66,8 @@ def summary(
                 [
                     *plain(warnings),
                     *(reason for _, reason in calibrated.left_out),
-                    *_reasons(run),  # which hold the warnings too
-                    *_reduced(run),
+                    *(read_check(check)["reasons"] if check.is_file() else []),  # which hold the warnings too
+                    *([plan.sentence] if plan and OVERRIDE in plan.sentence else []),
                     *solved.doubts,
                     *misfit(_last_numbers(run)),
                     *pieces(mesh, solved),
@@ -81,7 +80,7 @@ def summary(
         ),
         "fit": _last_numbers(run),
         "refined_lights": plain(_refined_lights(calibration, solved)),
-        "light_trial": _light_trial(solved),
+        "light_trial": trial and {"accepted": trial.is_accepted, "sentence": trial.sentence()} | asdict(trial),
         "mesh": {
             "size": mesh.extents.tolist(),
             "faces": len(mesh.faces),
@@ -121,7 +120,7 @@ def _said(calibrated: CalibratedViews, key: str) -> list[str]:
     return [*dict.fromkeys(text for view in calibrated.every() for text in view.calibration.residuals.get(key, []))]
 
 
-def _of_views(calibrated: CalibratedViews, solved: "SolvedScene") -> dict[str, Any]:
+def _of_views(calibrated: CalibratedViews, solved: SolvedScene) -> dict[str, Any]:
     """Return the rows of the single views, where there are several; of another lie, with how it lies in the first."""
     every = calibrated.every()
     if len(every) == 1:
@@ -172,18 +171,6 @@ def plain(value: Any) -> Any:
     return value
 
 
-def _reasons(run: RunFolder) -> list[str]:
-    """Return the reasons that the check gave before the solve."""
-    path = run.file(CHECK)
-    return read_check(path)["reasons"] if path.is_file() else []
-
-
-def _reduced(run: RunFolder) -> list[str]:
-    """Return how photos or pixels were reduced to fit into memory."""
-    plan = read_plan(run.file(PLAN))
-    return [plan.sentence] if plan and OVERRIDE in plan.sentence else []
-
-
 def _requests(run: RunFolder) -> list[str]:
     """Return the page's requests that were carried out, except a stop if the run has been continued since."""
     lines = read_log(run.file(LOG))
@@ -192,7 +179,7 @@ def _requests(run: RunFolder) -> list[str]:
     return [text for i, text in said if i > last or "goes on from here" not in text]
 
 
-def _refined_lights(calibration: Calibration, solved: "SolvedScene") -> list[dict[str, Any]]:
+def _refined_lights(calibration: Calibration, solved: SolvedScene) -> list[dict[str, Any]]:
     """Return each uncertain light after the solve, and its distance from its calibrated position or direction.
 
     `moved` is in units of the calibration (radians for a direction); `sigmas` is `moved` over the norm of `sigma`.
@@ -210,14 +197,6 @@ def _refined_lights(calibration: Calibration, solved: "SolvedScene") -> list[dic
     return rows
 
 
-def _light_trial(solved: "SolvedScene") -> dict[str, Any] | None:
-    """Return if refined lights were kept, and the errors of held-out shadow rays that decided; None if not tried."""
-    trial = solved.light_trial
-    if trial is None:
-        return None
-    return {"accepted": trial.is_accepted, "sentence": trial.sentence()} | asdict(trial)
-
-
 def misfit(numbers: dict[str, float]) -> list[str]:
     """Return a warning if the surface does not explain shadows that were held out from the fit."""
     error = numbers.get("loss_held_out", 0.0)
@@ -230,7 +209,7 @@ def misfit(numbers: dict[str, float]) -> list[str]:
     ]
 
 
-def pieces(mesh: trimesh.Trimesh, solved: "SolvedScene") -> list[str]:
+def pieces(mesh: trimesh.Trimesh, solved: SolvedScene) -> list[str]:
     """Return a warning if the mesh falls into pieces that hang in the air; without ground, into pieces at all."""
     parts = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)))
     if len(parts) < 2:
@@ -261,15 +240,13 @@ def guessed(mesh: trimesh.Trimesh) -> list[str]:
     ]
 
 
-def undersides(mesh: trimesh.Trimesh, solved: "SolvedScene") -> list[str]:
+def undersides(mesh: trimesh.Trimesh, solved: SolvedScene) -> list[str]:
     """Return a warning if a large part of the surface faces the ground and has no evidence; the base does not count.
 
     What the edge of a seat or a table's top shades hangs in shadow under every light, however far it hangs down.
     """
     if "evidence" not in mesh.vertex_attributes:
         return []
-    from reconstruct.mesh.evidence import UNCONSTRAINED
-
     unheld = (np.asarray(mesh.vertex_attributes["evidence"]).ravel() == UNCONSTRAINED)[mesh.faces].all(1)
     floor = max(solved.ground_height, float(mesh.bounds[0, 2])) + IN_THE_AIR * solved.grid.spacing
     hangs = unheld & (mesh.face_normals[:, 2] < FACES_DOWN) & (mesh.triangles_center[:, 2] > floor)
@@ -289,8 +266,6 @@ def _evidence(mesh: trimesh.Trimesh) -> dict[str, Any]:
     """
     if "evidence" not in mesh.vertex_attributes:
         return {}
-    from reconstruct.mesh.evidence import KINDS, volume_sigma
-
     kind, sigma = mesh.vertex_attributes["evidence"], mesh.vertex_attributes["sigma"]
     rows = {}
     for value, name in enumerate(KINDS):

@@ -165,7 +165,8 @@ def solve(
             solved = fit_steered(scenes, config, report, checkpoint, device, steering, earlier, run.activity)
         if not isinstance(solved, Rescheduled):
             break
-        _keep_schedule(solved, run)
+        save_state(solved.state, json.dumps(asdict(solved.config)), run.file(EARLIER))  # the change takes effect
+        run.write_json("config.json", asdict(solved.config) | {RESOLUTION: solved.resolution})  # with this file
     if steering.was_stopped:
         run.leave_open()
     else:
@@ -213,12 +214,6 @@ def schedule(options: RunOptions, run: RunFolder, source: Source) -> tuple[str, 
         config = within_budget(config, options.time_budget, work_of(source, options))
     run.write_json("config.json", asdict(config))
     return options.preset, config
-
-
-def _keep_schedule(change: Rescheduled, run: RunFolder) -> None:
-    """Store the current state and the new schedule; the change takes effect with the second file, config.json."""
-    save_state(change.state, json.dumps(asdict(change.config)), run.file(EARLIER))
-    run.write_json("config.json", asdict(change.config) | {RESOLUTION: change.resolution})
 
 
 def _reporter(run: RunFolder, scene: Scene) -> SolveReporter:

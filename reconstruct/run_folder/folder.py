@@ -319,15 +319,10 @@ class RunFolder:
         for left_over in self.path.glob(f".*{TEMPORARY}*"):  # by a killed run
             left_over.unlink()
         self.forgotten = withdraw_all(self.path)  # requests of an earlier invocation: a pause must not stop this one
-        self._manifest = self._read_manifest()
+        manifest = self.path / MANIFEST
+        self._manifest = read_manifest(manifest) if manifest.exists() else {}
         self.costs = {name: Cost(**cost) for name, cost in self._manifest.get("costs", {}).items()}
         self._continue_log()
-
-    def _read_manifest(self) -> dict[str, Any]:
-        path = self.path / MANIFEST
-        if not path.exists():
-            return {}
-        return read_manifest(path)
 
     def _continue_log(self) -> None:
         """Continue the counts of an earlier invocation's last log line; remove a half-written last line."""

@@ -17,6 +17,7 @@ except ImportError:  # Windows has no such locks
     fcntl = None
 
 LOCK = "lock"
+SAME_START_S = 1.0  # files hold rounded times
 
 
 def take_lock(folder: Path) -> None:
@@ -63,11 +64,26 @@ def lock_holder(path: Path) -> int | None:
     """Return the id of the running process that holds this lock; None if it is gone or the file has no id."""
     try:
         held = read_json(path)
-        process = psutil.Process(int(held["pid"]))
-        # ids are reused: the same id with another start time is another process
-        return process.pid if abs(process.create_time() - float(held["started"])) < 1.0 else None
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, psutil.Error):
+        process = running(int(held["pid"]), float(held["started"]))
+    except (OSError, ValueError, KeyError, TypeError, OverflowError):
         return None
+    return None if process is None else process.pid
+
+
+def running(pid: int, started: float) -> psutil.Process | None:
+    """Return the process of this id that started then (s since 1970); None if it has ended.
+
+    Ids are reused: the same id with another start time is another process.
+
+    Raises:
+        ValueError, OverflowError: there can be none of this id.
+    """
+    try:
+        process = psutil.Process(pid)
+        is_it = abs(process.create_time() - started) < SAME_START_S and process.status() != psutil.STATUS_ZOMBIE
+    except psutil.Error:
+        return None
+    return process if is_it else None
 
 
 @contextmanager

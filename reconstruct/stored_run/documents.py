@@ -1,10 +1,10 @@
 """Read the JSON files of a run: report.json, manifest.json, check.json, and the lines of log.jsonl."""
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from calibration.calibrated_views import CalibratedView
@@ -17,8 +17,9 @@ MOST_STAGES, MOST_VERSIONS = 64, 256
 MOST_PHOTOS = 10_000
 LONGEST_LINE = 1 << 16  # bytes of a line of the log
 MOST_LINES = 200_000  # of the log that are read
-LARGEST_COUNT = 1e15
-PROGRESS = {"t": 0.0, "cpu_s": 0.0, "done": 0.0, "total": 0.0}  # numbers of a line, and what stands for a missing one
+NOTHING_SAID = {"t": 0.0, "cpu_s": 0.0, "done": 0.0, "total": 0.0, "eta_s": None, "stage": "", "message": ""} | {
+    "numbers": {}
+}  # what stands for what a line of the log lacks
 RUN_AGAIN = "Run again, or ask for the file again."
 Angle = Annotated[float, Meta(ge=-360, le=360, description="an angle in degrees")]
 Scalar = Text | Number | bool | None  # what is shown as it stands
@@ -91,6 +92,19 @@ class _Manifest(Struct):
     costs: Annotated[dict[str, _Cost], Meta(max_length=MOST_STAGES)] = {}
     finished: Annotated[list[Text], Meta(max_length=MOST_STAGES)] = []
     made_with: Annotated[dict[str, Any], Meta(max_length=MOST_STAGES)] = {}
+
+
+class _Line(Struct):
+    """Of a line of log.jsonl, what is read."""
+
+    t: Number = 0.0
+    cpu_s: Number = 0.0
+    done: Number = 0.0
+    total: Number = 0.0
+    eta_s: Number = 0.0
+    stage: str = ""
+    message: str = ""
+    numbers: dict[str, Number] = {}
 
 
 class _CheckedLight(Struct):
@@ -170,29 +184,12 @@ def log_lines(content: bytes) -> list[dict[str, Any]]:
     for line in content.splitlines()[-MOST_LINES:]:
         try:
             found = parse_json(line.decode("utf-8", errors="replace")) if len(line) <= LONGEST_LINE else None
+            known = {key: value for key, value in msgspec.convert(found, dict).items() if value is not None}
+            msgspec.convert(known, _Line)
         except ValueError:
             continue  # the last line of a killed run
-        progress = _progress(found) if isinstance(found, dict) else None
-        if progress is not None:
-            lines.append(progress)
+        lines.append(NOTHING_SAID | known)
     return lines
-
-
-def _progress(line: dict[str, Any]) -> dict[str, Any] | None:
-    """Return a line of the log with all its keys, or None if one is of another kind."""
-    numbers = line.get("numbers") or {}
-    eta = line.get("eta_s")
-    texts = {name: line.get(name) or "" for name in ("stage", "message")}
-    counts = {name: line.get(name) if line.get(name) is not None else other for name, other in PROGRESS.items()}
-    is_well = isinstance(numbers, dict) and all(isinstance(text, str) for text in texts.values())
-    values = [*counts.values(), *([] if eta is None else [eta]), *(numbers.values() if is_well else ())]
-    if not is_well or not all(_is_number(value) for value in values):
-        return None
-    return {**line, **counts, **texts, "eta_s": eta, "numbers": numbers}
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) <= LARGEST_COUNT and math.isfinite(value)
 
 
 def lit_photos(report: Mapping[str, Any], views: Sequence[CalibratedView]) -> dict[str, dict[str, Any]]:

@@ -224,7 +224,7 @@ def polar_plot(calibration: Calibration, cover: ShadowCover) -> Sequence[str]:
     cells[half][2 * half + 1] = "+"
     for light, way in zip(calibration.lights, directions(calibration, cover.centre), strict=True):
         reach = half * np.arccos(np.clip(way[2], 0, 1)) / (np.pi / 2)
-        turn = from_the_camera(float(np.arctan2(way[1], way[0])), calibration, cover.centre)
+        turn = from_the_camera(float(np.arctan2(way[1], way[0])), calibration.posed_camera, cover.centre)
         row, column = half + round(reach * np.cos(turn)), 2 * half + 1 + round(2 * reach * np.sin(turn))
         cells[row][column] = "o" if light.used else "x"
     return ["".join(row).rstrip() for row in cells]

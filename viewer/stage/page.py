@@ -121,7 +121,7 @@ def write_page(run: StoredRun, path: Path, options: ExportOptions, progress: OnP
     path.write_text(stage_page(run.run_dir, progress), encoding="utf-8")
 
 
-def read_page(run: StoredRun, path: Path) -> Contents:
+def read(run: StoredRun, path: Path) -> Contents:
     """Read a page back and return what it holds.
 
     Raises:
