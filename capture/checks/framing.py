@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from capture.checks.registration import BLACK, Homography
+from capture.checks.registration import BLACK, Homography, moved
 from capture.photos.channels import mean_of_channels
 from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
@@ -95,7 +95,7 @@ class Framing:
         Few tiles may be off alike by as much as matches may differ, and no sample of them shows it.
         """
         grid, rng = _grid(width, height), np.random.default_rng(0)
-        here = _moved(self.homography, grid)
+        here = moved(self.homography, grid)
         tile = np.unique(self.to // (LONG_SIDE / TILES), axis=0, return_inverse=True)[1].ravel()
         members = [np.flatnonzero(tile == number) for number in range(tile.max() + 1)]
         apart = []
@@ -103,7 +103,7 @@ class Framing:
             some = np.concatenate([members[number] for number in rng.integers(len(members), size=len(members))])
             again = _fitted(self.seen[some], self.to[some], self.is_similarity)
             if again is not None and np.isfinite(again).all():
-                apart.append(np.mean(np.square(_moved(_of_stack(again, self.factor), grid) - here)))
+                apart.append(np.mean(np.square(moved(_of_stack(again, self.factor), grid) - here)))
         by_samples = np.sqrt(2 * np.median(apart)) if apart else 0.0
         return float(np.hypot(by_samples, NEAR_PX / self.factor / np.sqrt(len(members))))
 
@@ -269,9 +269,5 @@ def _grid(width: int, height: int) -> Float[np.ndarray, "n 2"]:
     return np.stack([u.ravel(), v.ravel()], -1)
 
 
-def _moved(matrix: Homography, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    return cv2.perspectiveTransform(points[:, None].astype(np.float64), matrix)[:, 0]
-
-
 def _moves(matrix: Homography, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    return np.hypot(*(_moved(matrix, points) - points).T)
+    return np.hypot(*(moved(matrix, points) - points).T)
