@@ -96,15 +96,10 @@ class Solution:
 
     def on_sheet(self, photo: Corners) -> Corners:
         """Return the corners of a photo with the sheet's heights and size in their points."""
-        bent = self.bent(photo)
-        return replace(bent, points=bent.points * self.lens.size_of(self.x)) if self.lens.stretch else bent
-
-    def bent(self, photo: Corners) -> Corners:
-        """Return the corners of a photo with the sheet's heights in their points."""
-        if self.sheet is None or not self.waves.size or not self.sheet.has(photo):
-            return photo
-        heights = nearest_corners(photo) @ self.heights()
-        return replace(photo, points=photo.points + np.outer(heights, [0.0, 0.0, 1.0]))
+        points = photo.points
+        if self.sheet is not None and self.waves.size and self.sheet.has(photo):
+            points = points + np.outer(nearest_corners(photo) @ self.heights(), [0.0, 0.0, 1.0])
+        return replace(photo, points=points * self.lens.size_of(self.x))
 
     def without(self, used: Bool[np.ndarray, " photos"]) -> "Solution":
         """Return the solution restricted to the used photos, as a start."""
