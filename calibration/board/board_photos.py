@@ -140,8 +140,8 @@ def _searched(own: list[_Photo], session: Session, board: AnyBoard, is_alone: bo
         return found
     lit = under_the_flashlight(session.lit, board)
     if lit is not None:
-        path, grey, focal, corners = lit
-        return [_Photo(path, grey, focal, COMMON if not own else own[0].view, corners), *found]
+        grey, focal, corners = lit
+        return [_Photo(session.lit[0], grey, focal, COMMON if not own else own[0].view, corners), *found]
     return _no_board(own[0].path.name, board, [own[0].grey]) if own else _no_photo(session, board)
 
 

@@ -34,9 +34,8 @@ NEWTON_STEPS = 5  # to the saddle point; the last moves it by less than 0.001 px
 FARTHEST_SADDLE = 0.5  # half windows between the corner and its saddle point: beyond, it belongs to something else
 SMOOTH_FROM = {3: 20, 2: 12}  # fewest corners for a cubic, a quadratic to separate lens distortion from wrong corners
 STRAY = {3: 0.06, 2: 0.08, 0: 0.25}  # of the spacing: how far a corner may be off that, and off no model of distortion
-MOST_PHOTOS = 8  # evenly chosen: corners average out, and each photo is read whole
-FEWEST_ALIKE = 3  # photos that show a corner at one place
-ALIKE_PX = 1.0  # from their median, at any size: corners are found within a tenth of a pixel
+MOST_PHOTOS = 8  # evenly chosen: each is read whole, and more change the median little
+FEWEST_ALIKE = 3  # photos, whose median leaves out what one of them hides
 
 
 @dataclass(frozen=True)
@@ -292,55 +291,26 @@ def _smooth(values: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], d
     return fitted
 
 
-def under_the_flashlight(lit: Sequence[Path], board: AnyBoard) -> tuple[Path, Grey, float | None, Corners] | None:
-    """Return a photo's path, brightness and focal length by EXIF, with the corners that most photos agree on.
+def under_the_flashlight(lit: Sequence[Path], board: AnyBoard) -> tuple[Grey, float | None, Corners] | None:
+    """Return what photos under the flashlight usually show, a focal length by EXIF, and the corners seen in it.
 
-    For a tripod without a photo of the board in room light. All photos are from one place, so each corner is seen in
-    about one pixel. Shadows and occluders put some of them off: the median over the photos does not follow.
+    For a tripod without a photo of the board in room light. All photos are from one place: shadows and occluders move,
+    and the median over the photos has none.
 
-    None where fewer than FEWEST_ALIKE photos show the board at one place.
+    None where there are fewer than FEWEST_ALIKE photos, or they do not show the board.
     """
     chosen = [lit[i] for i in np.unique(np.linspace(0, len(lit) - 1, MOST_PHOTOS).round().astype(int))] if lit else []
-    best: tuple[Path, Grey, float | None, Corners] | None = None
-    found: list[Corners] = []
+    if len(chosen) < FEWEST_ALIKE:
+        return None
+    greys, focal = [], None
     for path in chosen:
         photo = read_photo(path)
-        grey = grey_of(photo)
-        corners = find_board(grey, board)
-        if corners is None or not corners.is_placed or corners.across is not None:
-            continue
-        found.append(corners)
-        if best is None or len(corners.pixels) > len(best[3].pixels):
-            best = path, grey, photo.focal_35mm, corners
-    if best is None:
+        greys.append(grey_of(photo))
+        focal = focal or photo.focal_35mm
+    stack = np.stack(greys)
+    stack.partition(len(stack) // 2, axis=0)
+    usual = stack[len(stack) // 2]
+    corners = find_board(usual, board)
+    if corners is None or not corners.is_placed or corners.across is not None:
         return None
-    agreed = agreed_corners(found, best[3])
-    return None if agreed is None else (*best[:3], agreed)
-
-
-def agreed_corners(found: Sequence[Corners], first: Corners) -> Corners | None:
-    """Return the median place of each corner of `first` that FEWEST_ALIKE photos see near one place; None: too few."""
-    pixels, points = [], []
-    for point, pixel in zip(first.points, first.pixels, strict=True):
-        seen = np.array([place for one in found for place in _place_of(one, first, point, pixel)]).reshape(-1, 2)
-        if len(seen) < FEWEST_ALIKE:
-            continue
-        middle = np.median(seen, axis=0)
-        near = seen[np.linalg.norm(seen - middle, axis=1) < ALIKE_PX]
-        if len(near) >= FEWEST_ALIKE:
-            pixels.append(np.median(near, axis=0))
-            points.append(point)
-    if len(pixels) < FEWEST_CORNERS:
-        return None
-    return replace(first, pixels=np.array(pixels), points=np.array(points))
-
-
-def _place_of(one: Corners, first: Corners, point: np.ndarray, pixel: np.ndarray) -> list[np.ndarray]:
-    """Return where a photo sees a corner; a plain checkerboard may be numbered from the other end, then by place."""
-    if one.board != first.board:
-        return []
-    if one.board.turns_alike() < 4:
-        away = np.linalg.norm(one.pixels - pixel, axis=1)
-        return [one.pixels[int(away.argmin())]] if away.min() < 10 * ALIKE_PX else []
-    same = np.flatnonzero(np.linalg.norm(one.points - point, axis=1) < 1e-6)
-    return [one.pixels[int(same[0])]] if len(same) else []
+    return usual, focal, corners
