@@ -21,7 +21,7 @@ from capture.decode.sandbox import stop_decoders
 from capture.errors import CaptureError
 from capture.files.atomic import atomic_file
 from capture.photos.channels import largest_channel, mean_of_channels
-from capture.photos.store import DiskStore, MemoryStore, PhotoRecord, PhotoStore
+from capture.photos.store import PhotoRecord, PhotoStore
 
 CLIPPED_SRGB = 254 / 255  # encoded value from which a sample counts as saturated: JPEG rounds 255 down to 254
 CLIPPED_RAW = 0.98  # share of the white level from which a RAW value is no longer trusted to be linear
@@ -171,8 +171,7 @@ def read_stack(
     """
     if not paths:
         raise CaptureError("no photos were given, at least one is needed. Check the capture folder.")
-    settings = {"long_side": long_side, "as_linear": as_linear}
-    store: PhotoStore = MemoryStore(len(paths)) if kept is None else DiskStore(kept, [str(p) for p in paths], settings)
+    store = PhotoStore([str(p) for p in paths], kept, {"long_side": long_side, "as_linear": as_linear})
 
     def fill(index: int) -> None:
         store.put(index, *_read_reduced(paths[index], long_side, as_linear))
