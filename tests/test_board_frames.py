@@ -70,7 +70,7 @@ def test_a_frame_of_markers_gives_the_pose(spec, is_turned, is_legacy):
 def test_a_frame_is_recognised_without_a_name(spec):
     board = parse_board(spec)
     guess = guess_board([frame_photo(board, pose_above(board, seed=3))])
-    assert guess is not None and (guess.board.columns, guess.board.rows) == (board.columns, board.rows)
+    assert guess is not None and (guess.columns, guess.rows) == (board.columns, board.rows)
 
 
 @pytest.mark.parametrize("spec", SPECS)

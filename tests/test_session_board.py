@@ -61,7 +61,9 @@ def test_what_no_photo_tells_of_a_board_is_doubted(tmp_path):
     exif.get_ifd(0x8769)[42036] = "Phone 7 front camera 2.7mm f/2.2"
     photo.save(tmp_path / "b.jpg", quality=95, exif=exif)
     one = Session(tmp_path, (tmp_path / "b.jpg",), (), (), (), SessionSettings())
-    assumed, front = fit_board(one)[2]["warnings"]
+    residuals = fit_board(one)[2]
+    assert "millimetres are assumed" in residuals["notes"][0]
+    assumed, front = residuals["warnings"]
     assert "30 mm" in assumed and "name the board" in assumed
     assert "front camera" in front and "mirrored" in front
     assert len(fit_board(one, checker.spec())[2]["warnings"]) == 1

@@ -13,7 +13,7 @@ from calibration.board.lattice import find_lattices, flat_view
 from calibration.board.placement import place, placed_markers
 from calibration.board.sheet_edges import find_edges
 from capture.checks.robust import cauchy
-from capture.photos.photo import Photo, encode_srgb, read_photo
+from capture.photos.photo import Photo, encode_srgb, read_photo, smaller
 
 Grey = UInt8[np.ndarray, "_ _"]  # height, width; a reduced copy may stand beside the photo in one signature
 Markers = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 4 2"]]
@@ -137,7 +137,8 @@ def _placed(
         points = placement.board.points()[index[order]]
         pixels = (lattice.pixels[placement.used[order]] + 0.5) / scale - 0.5
         good = _fits_the_rest(pixels, points[:, :2], board.square_mm)
-        if good.sum() >= max(FEWEST_CORNERS, MOSTLY_GOOD * len(good)) and not _is_line(points[good]):
+        spans_plane = np.linalg.matrix_rank(points[good, :2] - points[good, :2].mean(0), tol=1e-6) == 2
+        if good.sum() >= max(FEWEST_CORNERS, MOSTLY_GOOD * len(good)) and spans_plane:
             yield Corners(pixels[good], points[good], placement.board, placement.is_placed)
 
 
@@ -193,9 +194,12 @@ def _saddles(
     because a corner looks the same after half a turn under any tone curve.
     """
     reach = np.maximum(share * spacing, SADDLE_SMALLEST)
-    window, corner = _blurred_part(
-        grey, pixels, 2 * reach.max(), max(BLUR_SHARE * float(np.median(spacing)), BLUR_SMALLEST)
-    )
+    blur = max(BLUR_SHARE * float(np.median(spacing)), BLUR_SMALLEST)
+    margin = 2 * reach.max() + 4 * blur
+    corner = np.maximum(np.floor(pixels.min(0) - margin), 0).astype(int)
+    end = np.ceil(pixels.max(0) + margin).astype(int)
+    part = grey[corner[1] : end[1] + 1, corner[0] : end[0] + 1].astype(np.float32)
+    window = np.asarray(cv2.GaussianBlur(part, (0, 0), blur))
     steps = np.linspace(-1, 1, SADDLE_SAMPLES)
     x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
     weight = np.exp(-(x**2 + y**2) / (2 * WEIGHT_WIDTH**2))
@@ -216,16 +220,6 @@ def _saddles(
     return np.where(is_saddle[:, None], at + corner, pixels)
 
 
-def _blurred_part(
-    grey: Grey, pixels: Float[np.ndarray, "n 2"], margin: float, blur: float
-) -> tuple[Float32[np.ndarray, "rows columns"], Float[np.ndarray, "2"]]:
-    """Return the blurred brightness around the corners, and the first pixel of that part."""
-    first = np.maximum(np.floor(pixels.min(0) - margin - 4 * blur), 0).astype(int)
-    last = np.ceil(pixels.max(0) + margin + 4 * blur).astype(int) + 1
-    part = grey[first[1] : last[1], first[0] : last[0]].astype(np.float32)
-    return np.asarray(cv2.GaussianBlur(part, (0, 0), blur)), first.astype(np.float64)
-
-
 # --- common ----------------------------------------------------------------------------------------------------------
 
 
@@ -234,15 +228,8 @@ def reduced(grey: Grey, size: int) -> tuple[Grey, float]:
 
     Pixel centres map as (p + 0.5) * factor - 0.5.
     """
-    factor = min(1.0, size / max(grey.shape))
-    if factor == 1.0:
-        return grey, 1.0
-    shape = (round(grey.shape[1] * factor), round(grey.shape[0] * factor))
-    return np.asarray(cv2.resize(grey, shape, interpolation=cv2.INTER_AREA)), shape[0] / grey.shape[1]
-
-
-def _is_line(points: Float[np.ndarray, "n 3"]) -> bool:
-    return bool(np.linalg.matrix_rank(points[:, :2] - points[:, :2].mean(0), tol=1e-6) < 2)
+    image = smaller(grey, size)
+    return image, image.shape[1] / grey.shape[1]
 
 
 def _fits_the_rest(

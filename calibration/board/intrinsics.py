@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from calibration.board.board import AnyBoard, Blank
 from calibration.board.board_pose import CORNER_SIGMA, PoseSpread, fit_pose, reprojected
@@ -56,17 +56,13 @@ class CameraFit:
 
     def pose_spread(self, index: int) -> PoseSpread:
         """How well the pose of a detection that is used, and the table under the sheet are known."""
-        sheet, waves = self.solution.sheet, self.solution.waves
-        table = np.diag([PAPER_MM**2, 0, 0]) + self._curl()
+        sheet, waves, board = self.solution.sheet, self.solution.waves, self.board
+        table = np.diag([PAPER_MM**2, 0, 0])
+        if isinstance(board, Blank):  # its edges may be curled
+            table = table + board.curl_mm**2 * np.diag([1.0, (2 / board.long_mm) ** 2, (2 / board.short_mm) ** 2])
         if sheet is not None:
             table = table + sheet.planes[waves.length] * waves.possible**2
         return PoseSpread(self.solution.pose_covariances[sum(self.used[:index])], table)
-
-    def _curl(self) -> Float[np.ndarray, "3 3"]:
-        """Covariance of the table's height over a blank sheet's edges, which may be curled, and of its slopes."""
-        if not isinstance(self.board, Blank):
-            return np.zeros((3, 3))
-        return self.board.curl_mm**2 * np.diag([1.0, (2 / self.board.long_mm) ** 2, (2 / self.board.short_mm) ** 2])
 
 
 PLAIN = Lens("three radial terms", False, (0, 1, 4), (K1_SIGMA, K2_SIGMA, K3_SIGMA))

@@ -156,7 +156,10 @@ def side_views(paths: Sequence[Path], board: Board, on_sheet: OnSheet, seen: Tri
         reason = "no object stands out in the tripod's photos, so nothing tells where to look for it"
         return [SideResult(path.name, None, reason) for path in paths]
     reference = read_photo(seen.board_photo)
-    tripod, where = _tripod(reference, seen), _whereabouts(seen.posed_camera.centre, outline, seen.reach())
+    eye, reach = seen.posed_camera.centre, seen.reach()
+    away = np.linalg.norm(outline[:, :2] - eye[:2], axis=1)
+    foot = outline[away <= np.percentile(away, NEAREST)].mean(0)
+    tripod, where = _tripod(reference, seen), _Whereabouts(outline, reach, most_height(eye, outline, reach), foot)
     results = []
     for path in paths:
         found = _side_view(read_photo(path), reference, board, on_sheet, tripod, where)
@@ -208,14 +211,6 @@ def _tripod(reference: Photo, seen: TripodObject) -> TripodView:
     if not stood_there(small, seen.lit, seen.mask):
         hides = np.zeros_like(hides)
     return TripodView(seen.posed_camera, reference.rgb, hides)
-
-
-def _whereabouts(
-    eye: Float[np.ndarray, "3"], outline: Float[np.ndarray, "n 3"], reach: Float[np.ndarray, "rays 3"]
-) -> _Whereabouts:
-    away = np.linalg.norm(outline[:, :2] - eye[:2], axis=1)
-    foot = outline[away <= np.percentile(away, NEAREST)].mean(0)
-    return _Whereabouts(outline, reach, most_height(eye, outline, reach), foot)
 
 
 def _side_view(

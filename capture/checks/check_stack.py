@@ -143,8 +143,13 @@ def check_and_register(
     dropped = {finding.photo for finding in kept if finding.drop}
     for i, path in enumerate(stack.paths):
         motion = own.get(i, np.eye(3)) @ (np.eye(3) if to_board is None else np.linalg.inv(to_board))
-        if path not in off | dropped and _shift_of(motion, stack) > NEAR_ENOUGH:
-            kept.append(_registered(stack, path, motion))
+        if path not in off | dropped and (length := _shift_of(motion, stack)) > NEAR_ENOUGH:
+            length *= stack.full_width / stack.rgb.shape[2]
+            text = (
+                f"the view lay {length:.1f} px off, as after a tap on the phone; the photo was moved back and is used"
+            )
+            limit = FARTHEST_PX * stack.full_width / REFERENCE_PX
+            kept.append(Finding(path, REGISTERED, text, length, limit, False, tuple(motion.ravel().tolist())))
     findings = _in_order(stack, kept)
     register(stack, findings)
     return findings
@@ -181,14 +186,6 @@ def _warped(picture: np.ndarray, motion: Homography, flags: int) -> np.ndarray:
 
 def _is_motion(finding: Finding) -> bool:
     return finding.kind in (MOVED, BOARD_OFF)
-
-
-def _registered(stack: PhotoStack, path: Path, motion: Homography) -> Finding:
-    to_file = stack.full_width / stack.rgb.shape[2]
-    length = to_file * _shift_of(motion, stack)
-    limit = FARTHEST_PX * stack.full_width / REFERENCE_PX
-    text = f"the view lay {length:.1f} px off, as after a tap on the phone; the photo was moved back and is used"
-    return Finding(path, REGISTERED, text, length, limit, False, tuple(float(value) for value in motion.ravel()))
 
 
 def _shift_of(motion: Homography, stack: PhotoStack) -> float:

@@ -213,15 +213,10 @@ class Points:
             numbers = numbers + step[:-1]
             if np.abs(moves @ step[:-1]).max() < SETTLED_PX:
                 break
-        return numbers, self._covariance(slopes, weighted, off, self.block[lit])
-
-    @staticmethod
-    def _covariance(slopes, weighted, off, block) -> Covariance:
-        """From the sandwich of a least-squares fit whose errors go together within a block of the picture."""
-        pull = np.zeros((BLOCKS**2, slopes.shape[1]))
-        np.add.at(pull, block, weighted * off[:, None])
+        pull = np.zeros((BLOCKS**2, slopes.shape[1]))  # for the sandwich: errors go together within a block
+        np.add.at(pull, self.block[lit], weighted * off[:, None])
         inverse = np.linalg.pinv(weighted.T @ slopes)
-        return (inverse @ (pull.T @ pull) @ inverse)[:-1, :-1]
+        return numbers, (inverse @ (pull.T @ pull) @ inverse)[:-1, :-1]
 
 
 def sigma_along(covariance: Covariance, shift: Shift) -> float:

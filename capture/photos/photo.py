@@ -220,14 +220,18 @@ def _read_reduced(
 def _reduce(
     rgb: Float[np.ndarray, "height width 3"], clipped: Bool[np.ndarray, "height width"], long_side: int
 ) -> tuple[Float[np.ndarray, "small_height small_width 3"], Bool[np.ndarray, "small_height small_width"]]:
-    height, width = clipped.shape
+    """Return both at most `long_side` px long: a saturated pixel taints every reduced one that it contributes to."""
+    if max(clipped.shape) <= long_side:
+        return rgb, clipped
+    return smaller(rgb, long_side), smaller(clipped.astype(np.float32), long_side) > 0
+
+
+def smaller(picture: Shaped[np.ndarray, "height width *channels"], long_side: int) -> Shaped[np.ndarray, "..."]:
+    """Return a picture, area-averaged so that the longer side is at most `long_side` px."""
+    height, width = picture.shape[:2]
     scale = min(1.0, long_side / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    if size == (width, height):
-        return rgb, clipped
-    # A saturated pixel taints every reduced pixel that it contributes to.
-    tainted = cv2.resize(clipped.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
-    return cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), tainted
+    return picture if scale == 1 else np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
 
 def _refuse_mixed_sizes(paths: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> None:
@@ -289,10 +293,7 @@ def read_thumbnail(path: Path, long_side: int) -> UInt8[np.ndarray, "height widt
     Raises:
         CaptureError: as `read_photo`.
     """
-    pixels = decode_small(path, long_side)
-    scale = min(1.0, long_side / max(pixels.shape[:2]))
-    size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
-    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    small = smaller(decode_small(path, long_side), long_side)
     if small.dtype == np.float32:
         return encode_srgb(small)
     return small if small.dtype == np.uint8 else (small / np.uint16(257)).astype(np.uint8)

@@ -249,7 +249,8 @@ def _roles(
         notes = tuple(f"{clip.name} was left out: the photos beside it are a capture" for clip in clips)
     except CaptureError as error:
         if not clips:
-            raise _with_faults(error, sound.left_out) from None
+            said = f"{error} Left out: {grouped(sound.left_out)}."
+            raise (type(error)(said) if sound.left_out else error) from None
         left_out, loose, stills = (
             sound.left_out,
             tuple(sound.by_role[""]),
@@ -303,11 +304,6 @@ def _named(folder: Path, name: str) -> Path:
     if not inside or not stored_file(path).is_file():
         raise CaptureError(f"{folder / SETTINGS_FILE} names {name}, which is not in {folder}. Correct the name.")
     return path
-
-
-def _with_faults(error: CaptureError, left_out: Sequence[Finding]) -> CaptureError:
-    """Return the error with what is wrong with the photos that were left out, all at once."""
-    return type(error)(f"{error} Left out: {grouped(left_out)}.") if left_out else error
 
 
 def _refuse_few_loose(sound: SoundPhotos, folder: Path) -> None:
