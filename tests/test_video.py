@@ -67,7 +67,7 @@ def test_a_frame_is_a_photo_like_any_other(tmp_path):
     path = write_counting(tmp_path / "clip.mp4")
     frame = frame_path(path, 0.8)
     photo = read_photo(frame)
-    assert not photo.is_linear and photo.taken_s is None and photo.path == frame
+    assert not photo.is_linear and photo.path == frame
     assert photo.rgb[20, 300] == pytest.approx([0.578, 0.102, 0.021], abs=0.03)  # RGB, not BGR
     assert read_size(frame) == (320, 240) and read_thumbnail(frame, 80).shape == (60, 80, 3)
     assert read_stack([frame, frame_path(path, 1.2)], 160).rgb.shape == (2, 120, 160, 3)

@@ -126,17 +126,10 @@ def see(
     pixels, full = project_from(points, pose, matrix, bends, lens.fisheye)
     by_log_fx, by_log_fy = matrix[0, 0] * full[:, 6], matrix[1, 1] * full[:, 7]
     distortion = full[:, [10 + k for k in lens.free]]
-    stretch = _by_stretch(points, pose, full[:, 3:6])[:, : len(lens.stretch)]
+    axes = np.asarray(cv2.Rodrigues(pose[:3])[0])[:, : len(lens.stretch)]  # of the board, along which it may be larger
+    stretch = (full[:, 3:6] @ axes) * np.repeat(points[:, : len(lens.stretch)], 2, axis=0)
     jacobian = np.column_stack([by_log_fx + by_log_fy, by_log_fy, full[:, 8:10], distortion, stretch, full[:, :6]])
     return photo.measured(pixels - photo.pixels, jacobian)
-
-
-def _by_stretch(
-    points: Float[np.ndarray, "corners 3"], pose: Float[np.ndarray, "6"], by_shift: Float[np.ndarray, "rows 3"]
-) -> Float[np.ndarray, "rows 2"]:
-    """Return the derivatives of the pixels by log size of the board along x and y, from those by translation."""
-    axes = np.asarray(cv2.Rodrigues(pose[:3])[0])[:, :2]
-    return (by_shift @ axes) * np.repeat(points[:, :2], 2, axis=0)
 
 
 def solve(photos: Sequence[Corners], prior: Prior, start: Solution | None = None) -> Solution:

@@ -103,7 +103,9 @@ def _by_lattice(grey: Grey, board: Board, allow_part: bool, enough: float) -> Co
     if best is None:
         return None
     view = _flat_view(best.pixels, best.points[:, :2], board.square_mm)
-    return best if view is None else replace(best, pixels=_saddles(grey, best.pixels, view[1], _clear_share(board)))
+    # Around a corner it is plain to the marker, or half way to the next corner.
+    share = min(SADDLE_WIDEST, TO_THE_MARKER * (1 - board.marker_mm / board.square_mm) / 2)
+    return best if view is None else replace(best, pixels=_saddles(grey, best.pixels, view[1], share))
 
 
 def grey_of(photo: Photo) -> Grey:
@@ -172,13 +174,6 @@ def read_markers(grey: Grey, dictionary: str) -> Markers:
             corners += np.sqrt(0.5) * outward / np.linalg.norm(outward, axis=1, keepdims=True)  # half a pixel inside
             read[number] = (corners + 0.5) / scale - 0.5
     return np.array(list(read), int), np.array(list(read.values())).reshape(-1, 4, 2)
-
-
-def _clear_share(board: Board) -> float:
-    """Return the plain distance around a corner in squares: to the marker, or half way to the next corner."""
-    if board.kind == "checkerboard":
-        return SADDLE_WIDEST
-    return min(SADDLE_WIDEST, TO_THE_MARKER * (1 - board.marker_mm / board.square_mm) / 2)
 
 
 # --- saddle points ---------------------------------------------------------------------------------------------------

@@ -192,7 +192,9 @@ def odd_one_out(silhouettes: Sequence[Silhouette], names: Sequence[str]) -> tupl
     measured = (
         f"the object stands {least}{shift.length:.1f} mm from where {others} saw it, {MOVED_MM:g} mm may be{doubt}"
     )
-    if shift.length > max(OTHER_MM, OTHER_SHARE * _size(silhouettes)):
+    # about how large the object is, mm: the root of its area in the picture, at the ground's distance
+    sizes = [np.sqrt(one.mask.sum()) * one.pixel(one.camera.looked_at()) for one in silhouettes]
+    if shift.length > max(OTHER_MM, OTHER_SHARE * float(np.median(sizes))):
         measured += ": is it another object, or a board of another size?"
         return view, f"{measured} Photograph one object on one sheet, and move nothing on the table."
     return view, f"{measured}. Nothing on the table may move between views: photograph this view again."
@@ -256,12 +258,6 @@ def _shift(found: Sequence[Tangent], view: int, fewest: int) -> Shift | None:
     millimetres = np.array([one.gap for one in own])
     rest = millimetres - np.array([_sign(one, view) * one.normal[:2] @ mm for one in own])
     return Shift(mm, sigmas, float(np.sqrt((millimetres**2).mean())), float(np.sqrt((rest**2).mean())))
-
-
-def _size(silhouettes: Sequence[Silhouette]) -> float:
-    """Return about how large the object is, mm: the root of its area in the picture, at the ground's distance."""
-    sizes = [np.sqrt(one.mask.sum()) * one.pixel(one.camera.looked_at()) for one in silhouettes]
-    return float(np.median(sizes))
 
 
 # --- boards whose ends are alike -------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 from PIL import Image
 
-from capture.decode.exif import Exposure, exposure_of, focal_of, taken_of
+from capture.decode.exif import Exposure, exposure_of, focal_of
 from capture.decode.formats import decode, decode_small, read_exif, reduction, stored_channels
 from capture.decode.sandbox import stop_decoders
 from capture.errors import CaptureError
@@ -41,7 +41,6 @@ class Photo:
     exposure: Exposure
     path: Path
     focal_35mm: float | None = None  # 35 mm equivalent focal length, mm
-    taken_s: float | None = None  # DateTimeOriginal as seconds since the epoch, no time zone
     is_linear: bool = False  # True for RAW: no tone curve had to be assumed
 
 
@@ -114,7 +113,6 @@ def read_photo(path: Path, as_linear: bool = False) -> Photo:
         exposure=exposure_of(decoded.exif),
         path=path,
         focal_35mm=focal_of(decoded.exif),
-        taken_s=taken_of(decoded.exif),
         is_linear=decoded.is_linear,
     )
 
@@ -270,7 +268,7 @@ def read_small_photo(path: Path, long_side: int) -> Photo:
     pixels = decode_small(path, long_side)
     rgb, clipped = _reduce(*_linear(pixels, False), long_side)
     exif = read_exif(path)
-    return Photo(rgb, clipped, exposure_of(exif), path, focal_of(exif), taken_of(exif), pixels.dtype == np.float32)
+    return Photo(rgb, clipped, exposure_of(exif), path, focal_of(exif), pixels.dtype == np.float32)
 
 
 def stack_of(photos: Sequence[Photo], full_size: tuple[int, int]) -> PhotoStack:
