@@ -156,7 +156,7 @@ def real(folder: Path) -> list[dict]:
             counts["photos"] += 1
             counts["found"] += corners is not None
             counts["of these in part"] += corners is not None and not corners.is_placed
-            same = guess is not None and guess.board.corner_counts() in _either_way(parse_board(spec).corner_counts())
+            same = guess is not None and guess.corner_counts() in _either_way(parse_board(spec).corner_counts())
             counts["recognised unnamed"] += same
             if corners is None:
                 missing.append(path.name)

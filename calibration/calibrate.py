@@ -63,13 +63,13 @@ def calibrate(
     dropped, usable = left_out(stack, findings)
     board = parse_board(residuals["board"])
     cues, sides = metric_cues(session, stack, usable, posed_camera, board, lens.on_sheet)
-    declared = session.settings.declared
+    declared = session.settings
     if declared.lights_at_once > 1:
         at_once = f"{session.folder}: session.toml declares {declared.lights_at_once} lights at once"
         wanted = "which the ground's shading cannot separate; their positions are needed, a line for each."
         raise CalibrationError(f"{at_once}, {wanted}", Remedy.LIGHTS_FILE)
     mixtures: list[str] = []
-    if declared.light_kind == "sun":
+    if declared.light == "sun":
         fit = locate_sun(stack, posed_camera, usable, declared.solids)
         notes = ["lights: from the shadows of declared objects"]
     else:

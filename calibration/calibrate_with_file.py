@@ -53,7 +53,7 @@ def calibrate_with_file(
     lit = [*stack.paths, *(one.photo for one in session.left_out if one.role == "lit")]
     every = [photo.name for photo in sorted(lit, key=natural_order)]
     given = read_lights(path, [photo.name for photo in stack.paths], posed_camera, every)
-    _refuse_other_count(given, session.settings.declared.lights_at_once, path)
+    _refuse_other_count(given, session.settings.lights_at_once, path)
     dropped, usable = left_out(stack, findings)
     notes = [*session.notes, *residuals.get("notes", []), *framing_notes, f"lights: from {path}", *given.notes]
     lights = given.lights

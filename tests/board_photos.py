@@ -1,12 +1,17 @@
-"""Photos of printed boards with exact truth: a flat print seen by a pinhole camera, by homography, no files."""
+"""Photos of printed boards with exact truth: a flat print seen by a pinhole camera, by homography."""
+
+from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from calibration.board.board import Board
 from calibration.board.corners import Corners
 from calibration.camera import Camera
 from calibration.pose import Pose
+from capture.session.session import Session, SessionSettings
 
 DOTS_PER_MM = 8
 MARGIN_MM = 15  # white paper around the print
@@ -35,6 +40,14 @@ def corners_of(board: Board, camera: Camera, world_from_camera: Pose, noise_px=0
     if rng is not None:
         pixels = pixels + rng.normal(0, noise_px, pixels.shape)
     return Corners(pixels, board.points(), board)
+
+
+def session_of(folder: Path, pictures: Sequence[np.ndarray], suffix=".png", **saved) -> Session:
+    """A session whose photos of the board are these, the tripod's first; `saved`: as Pillow saves them."""
+    paths = tuple(folder / f"b{index}{suffix}" for index in range(len(pictures)))
+    for path, picture in zip(paths, pictures, strict=True):
+        Image.fromarray(picture).convert("RGB").save(path, **saved)
+    return Session(folder, paths, (), (), (), SessionSettings())
 
 
 def board_photo(board: Board, camera: Camera, world_from_camera: Pose, noise=3.0, is_legacy=False) -> np.ndarray:

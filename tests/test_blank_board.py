@@ -1,8 +1,7 @@
-import cv2
 import numpy as np
 import pytest
 from blank_photos import blank_photo, edges_of
-from board_photos import look_at, slanted
+from board_photos import look_at, session_of, slanted
 
 import shadowgraph
 from calibration.board.board import BLANKS, parse_board
@@ -13,7 +12,6 @@ from calibration.board.intrinsics import fit_camera
 from calibration.camera import Camera
 from capture.decode.exif import FULL_FRAME_DIAGONAL
 from capture.errors import CalibrationError
-from capture.session.session import Session, SessionSettings
 
 SIZE = (1000, 750)
 CAMERA = Camera(*SIZE, 960.0, 960.0, 503.0, 371.0, (-0.06, 0.04, 0.0, 0.0, 0.0))
@@ -28,11 +26,8 @@ def poses_over(blank, n, fill=0.6, seed=1):
     return [slanted(rng, tilt, away, middle) for tilt in np.radians([42.0, 20.0, 35.0, 50.0, 28.0])[:n]]
 
 
-def session(folder, blank, n) -> Session:
-    paths = [folder / f"b{k}.png" for k in range(n)]
-    for path, pose in zip(paths, poses_over(blank, n), strict=True):
-        cv2.imwrite(str(path), blank_photo(blank, CAMERA, pose))
-    return Session(folder, tuple(paths), (), (), (), SessionSettings())
+def session(folder, blank, n):
+    return session_of(folder, [blank_photo(blank, CAMERA, pose) for pose in poses_over(blank, n)])
 
 
 def test_an_unknown_sheet_is_refused_with_the_known_ones():

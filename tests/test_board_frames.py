@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from board_photos import board_photo, corners_of, slanted
+from board_photos import board_photo, corners_of, session_of, slanted
 
 from calibration.board.board import Board, parse_board
 from calibration.board.board_photos import fit_board
@@ -14,7 +14,6 @@ from calibration.board.corners import _fits_the_rest, find_board
 from calibration.board.recognise import guess_board
 from calibration.camera import Camera
 from capture.errors import CalibrationError
-from capture.session.session import Session, SessionSettings
 
 CAMERA = Camera(1000, 750, 1000.0, 1000.0, 503.0, 371.0)
 SPECS = ("charuco:5x7:30:22:DICT_4X4_50", "charuco:6x8:25:18:DICT_5X5_100", "charuco:13x9:20:16:DICT_6X6_250")
@@ -70,7 +69,7 @@ def test_a_frame_of_markers_gives_the_pose(spec, is_turned, is_legacy):
 def test_a_frame_is_recognised_without_a_name(spec):
     board = parse_board(spec)
     guess = guess_board([frame_photo(board, pose_above(board, seed=3))])
-    assert guess is not None and (guess.board.columns, guess.board.rows) == (board.columns, board.rows)
+    assert guess is not None and (guess.columns, guess.rows) == (board.columns, board.rows)
 
 
 @pytest.mark.parametrize("spec", SPECS)
@@ -86,8 +85,7 @@ def test_what_a_mirror_on_the_board_reflects_does_not_move_the_pose(spec):
 
 def test_a_frame_that_was_stored_mirrored_is_refused_as_such(tmp_path):
     board = parse_board(SPECS[0])
-    cv2.imwrite(str(tmp_path / "b.png"), np.fliplr(frame_photo(board, pose_above(board, seed=5))))
-    session = Session(tmp_path, (tmp_path / "b.png",), (), (), (), SessionSettings())
+    session = session_of(tmp_path, [np.fliplr(frame_photo(board, pose_above(board, seed=5)))])
     with pytest.raises(CalibrationError, match=r"markers mirrored"):
         fit_board(session, board.spec())
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_photos import board_photo, look_at
+from board_photos import board_photo, look_at, session_of
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
@@ -13,7 +13,7 @@ from calibration.board.board import Board, parse_board
 from calibration.board.board_photos import fit_board
 from calibration.board.board_scale import scale_of, scale_parts, scale_sentence
 from calibration.camera import Camera
-from capture.session.session import Session, SessionSettings
+from capture.session.session import Session
 
 CAMERA = Camera(1200, 900, 1000.0, 1000.0, 599.5, 449.5)
 BOARD = Board("charuco", 5, 7, 30.0, 22.0, "DICT_4X4_50")
@@ -31,10 +31,7 @@ def places() -> tuple[np.ndarray, ...]:
 def session(folder: Path, tags: dict[int, object]) -> Session:
     exif = Image.Exif()
     exif.get_ifd(0x8769).update(tags)
-    paths = tuple(folder / f"IMG_{number}.jpg" for number in range(3))
-    for path, grey in zip(paths, places(), strict=True):
-        Image.fromarray(grey).convert("RGB").save(path, quality=95, exif=exif)
-    return Session(folder, paths, (), (), (), SessionSettings())
+    return session_of(folder, places(), ".jpg", quality=95, exif=exif)
 
 
 def found(tmp_path, spec, tags):

@@ -37,7 +37,8 @@ def photographed():
 def truth(monkeypatch, photographed):
     residuals = {"board": "checkerboard:9x6:20", "notes": [], "pose_covariance": np.zeros((6, 6)).tolist()}
     found = (POSED_CAMERA, residuals)
-    monkeypatch.setattr(glue, "fit_board", lambda session, spec: (found[0], FLAT_SHEET, found[1]))
+    for module in (glue, from_file):
+        monkeypatch.setattr(module, "fit_board", lambda session, spec: (found[0], FLAT_SHEET, found[1]))
     return photographed
 
 
@@ -61,8 +62,7 @@ def test_a_dropped_photo_keeps_its_place_and_says_why(truth, tmp_path):
 
 
 @pytest.mark.parametrize("named", [False, True])
-def test_where_nearly_all_photos_are_left_out_the_refusal_says_why(truth, tmp_path, monkeypatch, named):
-    monkeypatch.setattr(from_file, "fit_board", glue.fit_board)
+def test_where_nearly_all_photos_are_left_out_the_refusal_says_why(truth, tmp_path, named):
     (tmp_path / "lights.lp").write_text("\n".join(f"{path.name} 0 0 1" for path in truth.stack.paths))
     text = "40% of the pixels are saturated, 30% may be: expose less"
     findings = [Finding(path, "over-exposed", text, 0.4, 0.3, True) for path in truth.stack.paths[3:]]
@@ -76,8 +76,7 @@ def test_where_nearly_all_photos_are_left_out_the_refusal_says_why(truth, tmp_pa
 
 
 @pytest.mark.parametrize("sigma", [{}, {"sigma": [5, 5, 5]}])
-def test_a_list_of_lights_below_the_ground_is_refused_by_its_own_name(truth, tmp_path, monkeypatch, sigma):
-    monkeypatch.setattr(from_file, "fit_board", glue.fit_board)
+def test_a_list_of_lights_below_the_ground_is_refused_by_its_own_name(truth, tmp_path, sigma):
     rows = [{"photo": x.photo, "position": (np.array(x.position) * [1, 1, -1]).tolist()} | sigma for x in truth.lights]
     (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}))
     with pytest.raises(CalibrationError, match=r"lights\.json puts the light of IMG_0000\.jpg below the ground"):
@@ -87,7 +86,6 @@ def test_a_list_of_lights_below_the_ground_is_refused_by_its_own_name(truth, tmp
 def test_photos_from_the_side_count_with_lights_from_a_file_too(truth, tmp_path, monkeypatch):
     view = SideView("a.jpg", POSED_CAMERA, (0, 0, 8, 6), np.eye(6, 8) > 0, np.ones((6, 8), bool), 0.5)
     found = [SideResult("a.jpg", view, ""), SideResult("b.jpg", None, "the board was not found in it")]
-    monkeypatch.setattr(from_file, "fit_board", glue.fit_board)
     monkeypatch.setattr(from_file, "metric_cues", lambda *_: (MetricCues((view,)), found))
     rows = [{"photo": light.photo, "position": np.array(light.position).tolist()} for light in truth.lights]
     (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}))
@@ -97,8 +95,7 @@ def test_photos_from_the_side_count_with_lights_from_a_file_too(truth, tmp_path,
     assert truth.errors(result.lights).max() == 0
 
 
-def test_a_list_of_lights_in_metres_is_refused(truth, tmp_path, monkeypatch):
-    monkeypatch.setattr(from_file, "fit_board", glue.fit_board)
+def test_a_list_of_lights_in_metres_is_refused(truth, tmp_path):
     rows = [{"photo": light.photo, "position": (np.array(light.position) / 1000).tolist()} for light in truth.lights]
     (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}))
     with pytest.raises(
@@ -107,8 +104,7 @@ def test_a_list_of_lights_in_metres_is_refused(truth, tmp_path, monkeypatch):
         calibrate_with_file(session_of(truth), truth.stack, tmp_path / "lights.json")
 
 
-def test_photos_of_another_size_than_the_board_photo_are_refused(truth, tmp_path, monkeypatch):
-    monkeypatch.setattr(from_file, "fit_board", glue.fit_board)
+def test_photos_of_another_size_than_the_board_photo_are_refused(truth, tmp_path):
     (tmp_path / "lights.lp").write_text("\n".join(f"{path.name} 0 0 1" for path in truth.stack.paths))
     turned = replace(truth.stack, full_width=480, full_height=640)
     with pytest.raises(CalibrationError, match=r"is 640x480 px, .* are 480x640.*orientation\.$"):

@@ -113,14 +113,6 @@ def test_a_clip_of_the_flashlights_phone_is_refused(tmp_path, filmed):
         load_session(tmp_path)
 
 
-@pytest.mark.parametrize("count", ["3", "1000", "'many'", "12.5"])
-def test_a_wrong_number_of_frames_is_named(tmp_path, filmed, count):
-    (tmp_path / "clip.mp4").symlink_to(filmed)
-    (tmp_path / "session.toml").write_text(f"clip_frames = {count}\n")
-    with pytest.raises(CaptureError, match="clip_frames is"):
-        load_session(tmp_path)
-
-
 @pytest.mark.slow
 def test_frames_run_through_manifest_thumbnails_and_resuming_like_photos(tmp_path, filmed):
     (tmp_path / "capture").mkdir()

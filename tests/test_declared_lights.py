@@ -129,8 +129,8 @@ side_mm = 60
 turn_deg = 90
 """
     (tmp_path / "session.toml").write_text(text)
-    declared = load_settings(tmp_path).declared
-    assert declared.light_kind == "sun"
+    declared = load_settings(tmp_path)
+    assert declared.light == "sun"
     assert declared.solids[0] == Solid(10.0, -20.0, 50.0, 5.0)
     assert declared.solids[1].height == 60.0 and declared.solids[1].turn == pytest.approx(np.pi / 2)
 

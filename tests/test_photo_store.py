@@ -70,8 +70,8 @@ def test_a_list_that_is_none_starts_anew(paths, tmp_path, monkeypatch, content):
     assert len(opened) == len(paths) and np.array_equal(stack.rgb, read_stack(paths, 8).rgb)
 
 
-def test_photos_of_another_size_are_refused_by_name_on_disk_as_well(paths, tmp_path):
+def test_photos_of_another_size_are_refused_by_name_in_memory_and_on_disk(paths, tmp_path):
     Image.new("RGB", (20, 10)).save(paths[3])
-    for _ in range(2):
+    for kept in (None, tmp_path / "kept", tmp_path / "kept"):
         with pytest.raises(CaptureError, match=r"1 of 5 photos .* 3\.png \(20 x 10\)"):
-            read_stack(paths, 8, kept=tmp_path / "kept")
+            read_stack(paths, 8, kept=kept)

@@ -114,6 +114,7 @@ def test_settings_overrule_what_was_found(tmp_path):
         ("led_offset_mm = [nan, 0, 1]", "three numbers"),
         (f"led_offset_mm = [{'9' * 400}, 0, 1]", "three numbers"),
         (f"clip_frames = {'9' * 5000}", "not valid TOML"),
+        *((f"clip_frames = {count}", f"clip_frames is {count}") for count in ("3", "1000", "'many'", "12.5")),
         ("board_thickness_mm = -1", "millimetres from the table"),
         ("board = ", "not valid TOML"),
         ("roles = { lid = ['a.jpg'] }", "lists of file names"),

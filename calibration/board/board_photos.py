@@ -140,8 +140,8 @@ def _searched(own: list[_Photo], session: Session, board: AnyBoard, is_alone: bo
         return found
     lit = under_the_flashlight(session.lit, board)
     if lit is not None:
-        path, grey, focal, corners = lit
-        return [_Photo(path, grey, focal, COMMON if not own else own[0].view, corners), *found]
+        grey, focal, corners = lit
+        return [_Photo(session.lit[0], grey, focal, COMMON if not own else own[0].view, corners), *found]
     return _no_board(own[0].path.name, board, [own[0].grey]) if own else _no_photo(session, board)
 
 
@@ -170,7 +170,8 @@ def _fit_group(
     more = [*(photo for view in views for photo in view[1:]), *(one for one in extra if _same_lens(one, tripods[0]))]
     seen = [photo for photo in [*tripods, *more] if photo.corners is not None]
     corners = [photo.corners for photo in seen if photo.corners is not None]
-    notes = [*notes, *_blank_notes(tripods[0], corners)]
+    if isinstance(corners[0].board, Blank):
+        notes = [*notes, _sides_note(corners[0].board, corners, tripods[0].grey, tripods[0].path.name)]
     size = (tripods[0].grey.shape[1], tripods[0].grey.shape[0])
     fit = fit_camera(corners, size, tripods[0].focal_35mm, keep_first=len(views) == 1)
     fits: list[BoardFit | CalibrationError] = []
@@ -236,6 +237,11 @@ def _above(
     doubts = scale_doubts(board, away, tripod.path.name, optics, share)
     for doubt in doubts:  # now, since lights are long looked for at a wrong scale
         LOG.warning(doubt)
+    if not tripod.corners.is_placed:
+        part = (
+            "The tripod's photo shows only a part of the board: ground and scale are known, the origin is one corner."
+        )
+        notes = [*notes, part]
     residuals = {
         "board": board.spec(),
         "scale": scale_of(board, is_named),
@@ -247,17 +253,10 @@ def _above(
         "camera_height_sigma_mm": ground.height_sigma_mm,
         "pose_covariance": ground.covariance.tolist(),
         "sheet_waves_mm": fit.waves_mm(),
-        "notes": [*notes, *_partly_seen(tripod.corners), *fit.notes],
+        "notes": [*notes, *fit.notes],
         "warnings": [*_warnings(tripod.path, board, is_named), *doubts],
     }
     return BoardFit(PosedCamera(fit.camera, ground.world_from_camera, 0.0), fit, residuals)
-
-
-def _blank_notes(tripod: _Photo, corners: Sequence[Corners]) -> list[str]:
-    """Return the note about a blank sheet, after a check of its sides' ratio."""
-    assert tripod.corners is not None
-    board = tripod.corners.board
-    return _check_sides(board, list(corners), tripod.grey, tripod.path.name) if isinstance(board, Blank) else []
 
 
 def _warnings(tripod: Path, board: AnyBoard, is_named: bool) -> list[str]:
@@ -285,14 +284,8 @@ def _mirrored(name: str) -> CalibrationError:
     )
 
 
-def _partly_seen(corners: Corners) -> list[str]:
-    if corners.is_placed:
-        return []
-    return ["The tripod's photo shows only a part of the board: ground and scale are known, the origin is one corner."]
-
-
-def _check_sides(board: Blank, found: list[Corners], grey: Grey, name: str) -> list[str]:
-    """Return a note about what a blank sheet can tell.
+def _sides_note(board: Blank, found: list[Corners], grey: Grey, name: str) -> str:
+    """Return the note about a blank sheet, after a check of its sides' ratio.
 
     Raises:
         CalibrationError: the sheet's sides have another ratio than the named paper's.
@@ -307,10 +300,10 @@ def _check_sides(board: Blank, found: list[Corners], grey: Grey, name: str) -> l
             f"board {board.spec()}: the sides of the sheet in {name} have the ratio {ratio:.3f} +- "
             f"{sigma * ratio:.3f}, {board.ratio():.3f} was needed. {advice}"
         )
-    return [
+    return (
         f"No printed board: camera and scale are from the edges of a blank one, {board.spec()}, "
         f"{board.long_mm:g} x {board.short_mm:g} mm. Which of its ends is the origin is arbitrary."
-    ]
+    )
 
 
 def _named_board(greys: list[Grey], spec: str | None, names: list[str]) -> tuple[AnyBoard, list[str]]:
@@ -328,9 +321,9 @@ def _named_board(greys: list[Grey], spec: str | None, names: list[str]) -> tuple
             Remedy.NAME_BOARD,
             Remedy.LIGHTS_FILE,
         )
-    if guess.board.kind == "checkerboard" and is_mirrored(greys):
+    if guess.kind == "checkerboard" and is_mirrored(greys):
         raise _mirrored(names[0])
-    return guess.board, [guess.note]
+    return guess, [f"No board was named; the photos show {guess.spec()}, whose millimetres are assumed."]
 
 
 def _no_board(name: str, board: AnyBoard, greys: list[Grey]) -> CalibrationError:
@@ -343,7 +336,7 @@ def _no_board(name: str, board: AnyBoard, greys: list[Grey]) -> CalibrationError
     if is_mirrored(greys[:1]):
         return _mirrored(name)
     guess = guess_board(greys[:1])
-    hint = f" The photo seems to show {guess.board.spec()} (millimetres unknown)." if guess else ""
+    hint = f" The photo seems to show {guess.spec()} (millimetres unknown)." if guess else ""
     return CalibrationError(
         f"board {board.spec()} not found in {name}, the tripod's photo.{hint} "
         "Check the board's description, and keep all of it in view, flat, in focus and evenly lit."

@@ -1,5 +1,6 @@
 """Estimate the camera's pose above the board with its uncertainty; ambiguous poses are refused."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -28,9 +29,15 @@ WORST_MISFIT = 0.002  # of the photo's longer side: 8 px at 4000 is a wrong boar
 class BoardView:
     """One pose from which the camera could have seen the corners."""
 
-    camera_from_world: Pose
+    numbers: Float[np.ndarray, " numbers"]  # of camera_from_world: rotation vector, translation; then log f over the
+    # camera's where it is free
     cost: float  # robust sum of squared residuals, px^2
-    residuals: Float[np.ndarray, "n 2"]  # px, seen minus projected
+    residuals: Float[np.ndarray, "n 2"]  # px, projected minus seen
+
+    @property
+    def camera_from_world(self) -> Pose:
+        """The pose."""
+        return Pose(np.asarray(cv2.Rodrigues(self.numbers[:3])[0]), self.numbers[3:6])
 
     def rms(self) -> float:
         """Root of the mean squared distance between seen and projected corners, px."""
@@ -93,14 +100,14 @@ def fit_ground(
             "Check the board's columns and rows, and that it lies flat."
         )
     _refuse_ambiguous(views, robust_at / 3)
-    covariance = _pose_covariance(best, corners, camera) if spread is None else spread.pose
+    covariance = pose_covariance(best, corners, camera) if spread is None else spread.pose
     normal_sigma, height_sigma = _uncertainty(best, corners, covariance, spread)
     if normal_sigma > WORST_NORMAL:
         raise CalibrationError(
             f"board pose: the ground's tilt is uncertain by {np.degrees(normal_sigma):.1f} degrees, "
             f"at most {np.degrees(WORST_NORMAL):.0f} needed. {_ADVICE}"
         )
-    in_world = _in_world(best.camera_from_world, covariance)
+    in_world = _in_world(best, covariance)
     return GroundFit(best.camera_from_world.inverse(), best.rms(), normal_sigma, height_sigma, in_world)
 
 
@@ -134,12 +141,19 @@ def _refuse_ambiguous(views: list[BoardView], noise: float) -> None:
         )
 
 
-def board_views(corners: Corners, camera: Camera, robust_at: float = ROBUST_AT) -> list[BoardView]:
-    """Return the locally optimal poses with the camera above the ground, best first: two, one or none."""
+def board_views(
+    corners: Corners, camera: Camera, robust_at: float = ROBUST_AT, is_refocused: bool = False
+) -> list[BoardView]:
+    """Return the locally optimal poses with the camera above the ground, best first: two, one or none.
+
+    Args:
+        is_refocused: the focal length may differ from the camera's as phones refocus.
+    """
     views: list[BoardView] = []
     for start in plane_poses(corners.points, camera.unproject(corners.pixels)[:, :2])[0]:
-        view = _refined(start, corners, camera, robust_at)
-        if view.camera_from_world.inverse().translation[2] <= 0 or _sees_behind(view, corners):
+        view = fit_pose(np.append(start, 0.0) if is_refocused else start, corners, camera, robust_at)
+        is_above = view.camera_from_world.inverse().translation[2] > 0
+        if not is_above or (view.camera_from_world.apply(corners.points)[:, 2] <= 0).any():
             continue
         if not any(np.allclose(view.normal(), v.normal(), atol=1e-4) for v in views):  # both led to one optimum
             views.append(view)
@@ -171,69 +185,63 @@ def _ippe(
     return poses, np.ravel(errors)[: len(poses)]
 
 
-def _sees_behind(view: BoardView, corners: Corners) -> bool:
-    return bool((view.camera_from_world.apply(corners.points)[:, 2] <= 0).any())
+def fit_pose(start: Float[np.ndarray, " numbers"], corners: Corners, camera: Camera, robust_at: float) -> BoardView:
+    """Return the nearest local optimum of the reprojection error under Cauchy's loss; `start`: BoardView.numbers."""
+
+    def with_prior(values: np.ndarray, of_focus: np.ndarray) -> np.ndarray:
+        return np.concatenate([values, of_focus * CORNER_SIGMA / FOCUS_SIGMA])
+
+    def residuals(x: Float[np.ndarray, " numbers"]) -> Float[np.ndarray, " m"]:
+        return with_prior(reprojected(x, corners, camera)[0].ravel(), x[6:])
+
+    def jacobian(x: Float[np.ndarray, " numbers"]) -> Float[np.ndarray, "m numbers"]:
+        return with_prior(reprojected(x, corners, camera)[1][:, : len(x)], np.eye(len(x))[6:])
+
+    fit = least_squares(residuals, start, jacobian, x_scale="jac", loss="cauchy", f_scale=robust_at, max_nfev=60)
+    return BoardView(fit.x, 2 * float(fit.cost), fit.fun[: 2 * len(corners.pixels)].reshape(-1, 2))
 
 
-def _refined(start: Float[np.ndarray, "6"], corners: Corners, camera: Camera, robust_at: float) -> BoardView:
-    """The nearest local optimum of the reprojection error under Cauchy's loss."""
+def reprojected(
+    numbers: Float[np.ndarray, " numbers"], corners: Corners, camera: Camera
+) -> tuple[Float[np.ndarray, "corners 2"], Float[np.ndarray, "rows columns"]]:
+    """Return projected minus seen corners, px, and the Jacobian by pose, log f, cx and cy.
 
-    def residuals(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, " m"]:
-        return _project(x, corners, camera)[0]
-
-    def jacobian(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "m 6"]:
-        return _project(x, corners, camera)[1][:, :6]
-
-    fit = least_squares(residuals, start, jacobian, x_scale="jac", loss="cauchy", f_scale=robust_at, max_nfev=50)
-    rotation = np.asarray(cv2.Rodrigues(fit.x[:3])[0])
-    return BoardView(Pose(rotation, fit.x[3:]), 2 * float(fit.cost), -fit.fun.reshape(-1, 2))
-
-
-def _project(
-    x: Float[np.ndarray, "6"], corners: Corners, camera: Camera
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m columns"]]:
-    """Projected minus seen, px, and the Jacobian of project_from."""
-    lens = camera.matrix(), np.array(camera.distortion), camera.fisheye
-    pixels, jacobian = project_from(corners.points, x, *lens)
-    offsets, jacobian = corners.measured(pixels - corners.pixels, jacobian)
-    return offsets.ravel(), jacobian
+    Args:
+        numbers: as a BoardView has them.
+    """
+    matrix = camera.matrix()
+    matrix[[0, 1], [0, 1]] *= np.exp(numbers[6:]).prod()
+    pixels, full = project_from(corners.points, numbers[:6], matrix, np.array(camera.distortion), camera.fisheye)
+    by_focal = matrix[0, 0] * full[:, 6] + matrix[1, 1] * full[:, 7]
+    return corners.measured(pixels - corners.pixels, np.column_stack([full[:, :6], by_focal, full[:, 8:10]]))
 
 
-def _numbers(pose: Pose) -> Float[np.ndarray, "6"]:
-    return np.concatenate([np.ravel(cv2.Rodrigues(pose.rotation)[0]), pose.translation])
-
-
-def _in_world(camera_from_world: Pose, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
+def _in_world(view: BoardView, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
     """Return the covariance of turn w (rad) and shift c (mm): world_from_camera becomes exp(w) R, t + c.
 
     Args:
         covariance: of rotation vector and translation, camera from world.
     """
-    x, back = _numbers(camera_from_world), camera_from_world.inverse()
+    back = view.camera_from_world.inverse()
 
     def change(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "6"]:
         rotation = np.asarray(cv2.Rodrigues(x[:3])[0])
         turn = np.ravel(cv2.Rodrigues(rotation.T @ back.rotation.T)[0])
         return np.concatenate([turn, -rotation.T @ x[3:] - back.translation])
 
-    steps = np.sqrt(np.diag(covariance)) * 1e-2 + 1e-9
-    slope = np.stack([(change(x + d) - change(x - d)) / (2 * d.sum()) for d in np.diag(steps)], 1)
-    return slope @ covariance @ slope.T
+    return _propagated(change, view, covariance)
 
 
 def _uncertainty(
     view: BoardView, corners: Corners, covariance: Float[np.ndarray, "6 6"], spread: PoseSpread | None
 ) -> tuple[float, float]:
     """Return one sigma of the normal (rad) and of the camera's height (mm)."""
-    x = _numbers(view.camera_from_world)
 
     def outcome(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4"]:
         rotation = np.asarray(cv2.Rodrigues(x[:3])[0])
         return np.append(rotation[:, 2], -(rotation.T @ x[3:])[2])
 
-    steps = np.sqrt(np.diag(covariance)) * 1e-2 + 1e-9  # well inside the noise, well above rounding
-    slope = np.stack([(outcome(x + d) - outcome(x - d)) / (2 * d.sum()) for d in np.diag(steps)], 1)
-    result = slope @ covariance @ slope.T
+    result = _propagated(outcome, view, covariance)
     tilt, height = np.trace(result[:3, :3]), result[3, 3]
     if spread is not None:
         aside = view.camera_from_world.inverse().translation[:2] - corners.board.points()[:, :2].mean(0)
@@ -242,35 +250,29 @@ def _uncertainty(
     return float(np.sqrt(tilt)), float(np.sqrt(height))
 
 
-def _pose_covariance(view: BoardView, corners: Corners, camera: Camera) -> Float[np.ndarray, "6 6"]:
-    """Return the covariance of one photo's pose.
+def _propagated(
+    outcome: Callable[[Float[np.ndarray, "6"]], Float[np.ndarray, " k"]],
+    view: BoardView,
+    covariance: Float[np.ndarray, "6 6"],
+) -> Float[np.ndarray, "k k"]:
+    """Return the covariance of what follows from a pose, by differences well inside the noise, well above rounding."""
+    x, steps = view.numbers[:6], np.diag(np.sqrt(np.diag(covariance)) * 1e-2 + 1e-9)
+    slope = np.stack([(outcome(x + d) - outcome(x - d)) / (2 * d.sum()) for d in steps], 1)
+    return slope @ covariance @ slope.T
+
+
+def pose_covariance(view: BoardView, corners: Corners, camera: Camera) -> Float[np.ndarray, "numbers numbers"]:
+    """Return the covariance of one photo's pose, and of its focal length where that is free.
 
     Corner noise and the camera's sigmas are propagated; the latter by the implicit function theorem:
     dx = -(J'J)^-1 J' J_camera dc.
     """
-    full = _project(_numbers(view.camera_from_world), corners, camera)[1]
-    pose, lens = full[:, :6], np.stack([full[:, 6] + full[:, 7], full[:, 8], full[:, 9]], 1)
-    inverse = np.linalg.pinv(pose.T @ pose)
-    per_camera = inverse @ pose.T @ lens * [camera.sigmas.get(name, 0.0) for name in ("fx", "cx", "cy")]
-    return inverse * max(FINEST_SIGMA, view.rms()) ** 2 + per_camera @ per_camera.T
-
-
-def fit_pose_and_focus(start: Pose, corners: Corners, camera: Camera):
-    """Fit rotation vector, translation (camera from world) and log focal scale; the last residual is the prior's."""
-    weight = CORNER_SIGMA / FOCUS_SIGMA
-    distortion = np.array(camera.distortion)
-
-    def project(x: Float[np.ndarray, "7"]) -> tuple[np.ndarray, np.ndarray]:
-        matrix = camera.matrix() * np.array([[np.exp(x[6]), 1, 1], [1, np.exp(x[6]), 1], [1, 1, 1]])
-        pixels, full = project_from(corners.points, x[:6], matrix, distortion, camera.fisheye)
-        by_focal = matrix[0, 0] * full[:, 6] + matrix[1, 1] * full[:, 7]
-        return pixels - corners.pixels, np.column_stack([full[:, :6], by_focal])
-
-    def residuals(x: Float[np.ndarray, "7"]) -> Float[np.ndarray, " rows"]:
-        return np.append(project(x)[0].ravel(), weight * x[6])
-
-    def jacobian(x: Float[np.ndarray, "7"]) -> Float[np.ndarray, "rows 7"]:
-        return np.vstack([project(x)[1], [0, 0, 0, 0, 0, 0, weight]])
-
-    first = np.concatenate([np.ravel(cv2.Rodrigues(start.rotation)[0]), start.translation, [0.0]])
-    return least_squares(residuals, first, jacobian, x_scale="jac", loss="cauchy", f_scale=ROBUST_AT, max_nfev=60)
+    full, noise = reprojected(view.numbers, corners, camera)[1], max(FINEST_SIGMA, view.rms())
+    own = full[:, : len(view.numbers)]
+    prior = np.diag([0.0] * 6 + [(noise / FOCUS_SIGMA) ** 2] * (len(view.numbers) - 6))
+    inverse = np.linalg.pinv(own.T @ own + prior)
+    if len(view.numbers) > 6:
+        return inverse * noise**2
+    sigmas = [camera.sigmas.get("fx", 0.0) / camera.fx, camera.sigmas.get("cx", 0.0), camera.sigmas.get("cy", 0.0)]
+    per_camera = inverse @ own.T @ full[:, 6:] * sigmas
+    return inverse * noise**2 + per_camera @ per_camera.T

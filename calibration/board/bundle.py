@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from calibration.board.board_pose import CORNER_SIGMA, plane_poses
@@ -95,15 +96,10 @@ class Solution:
 
     def on_sheet(self, photo: Corners) -> Corners:
         """Return the corners of a photo with the sheet's heights and size in their points."""
-        bent = self.bent(photo)
-        return replace(bent, points=bent.points * self.lens.size_of(self.x)) if self.lens.stretch else bent
-
-    def bent(self, photo: Corners) -> Corners:
-        """Return the corners of a photo with the sheet's heights in their points."""
-        if self.sheet is None or not self.waves.size or not self.sheet.has(photo):
-            return photo
-        heights = nearest_corners(photo) @ self.heights()
-        return replace(photo, points=photo.points + np.outer(heights, [0.0, 0.0, 1.0]))
+        points = photo.points
+        if self.sheet is not None and self.waves.size and self.sheet.has(photo):
+            points = points + np.outer(nearest_corners(photo) @ self.heights(), [0.0, 0.0, 1.0])
+        return replace(photo, points=points * self.lens.size_of(self.x))
 
     def without(self, used: Bool[np.ndarray, " photos"]) -> "Solution":
         """Return the solution restricted to the used photos, as a start."""
@@ -130,17 +126,10 @@ def see(
     pixels, full = project_from(points, pose, matrix, bends, lens.fisheye)
     by_log_fx, by_log_fy = matrix[0, 0] * full[:, 6], matrix[1, 1] * full[:, 7]
     distortion = full[:, [10 + k for k in lens.free]]
-    stretch = _by_stretch(points, pose, full[:, 3:6])[:, : len(lens.stretch)]
+    axes = np.asarray(cv2.Rodrigues(pose[:3])[0])[:, : len(lens.stretch)]  # of the board, along which it may be larger
+    stretch = (full[:, 3:6] @ axes) * np.repeat(points[:, : len(lens.stretch)], 2, axis=0)
     jacobian = np.column_stack([by_log_fx + by_log_fy, by_log_fy, full[:, 8:10], distortion, stretch, full[:, :6]])
     return photo.measured(pixels - photo.pixels, jacobian)
-
-
-def _by_stretch(
-    points: Float[np.ndarray, "corners 3"], pose: Float[np.ndarray, "6"], by_shift: Float[np.ndarray, "rows 3"]
-) -> Float[np.ndarray, "rows 2"]:
-    """Return the derivatives of the pixels by log size of the board along x and y, from those by translation."""
-    axes = np.asarray(cv2.Rodrigues(pose[:3])[0])[:, :2]
-    return (by_shift @ axes) * np.repeat(points[:, :2], 2, axis=0)
 
 
 def solve(photos: Sequence[Corners], prior: Prior, start: Solution | None = None) -> Solution:
@@ -160,10 +149,11 @@ def solve(photos: Sequence[Corners], prior: Prior, start: Solution | None = None
         if abs(waves.size - before.size) <= SAME_SIZE * before.size:
             break
     n_lens = prior.lens.n_numbers()
-    covariances = problem.bent_by(sheet, waves.possible, waves).normal(x).covariances(n_lens)
+    inverse = np.linalg.inv(problem.bent_by(sheet, waves.possible, waves).normal(x).square)
+    every = [problem.numbers(index) for index in range(len(photos))]
+    poses = np.array([inverse[np.ix_(own[n_lens:], own[n_lens:])] for own in every])
     rms = tuple(float(np.sqrt((d**2).mean())) for d in problem.distances(x))
-    poses = covariances[:, n_lens:, n_lens:]
-    return Solution(prior.lens, x, covariances[0], rms, sheet, waves, poses, problem.noise)
+    return Solution(prior.lens, x, inverse[np.ix_(every[0], every[0])], rms, sheet, waves, poses, problem.noise)
 
 
 @dataclass(frozen=True)
@@ -187,6 +177,11 @@ class _Problem:
         n_lens = self.prior.lens.n_numbers()
         return n_lens, n_lens + 6 * len(self.photos)
 
+    def numbers(self, index: int) -> Int[np.ndarray, " lens_and_pose"]:
+        """Return where in x the lens and a photo's pose are."""
+        n_lens = self.ends()[0]
+        return np.append(np.arange(n_lens), n_lens + 6 * index + np.arange(6))
+
     def seen(
         self, x: Float[np.ndarray, " n"], index: int
     ) -> tuple[Float[np.ndarray, "corners 2"], Float[np.ndarray, "rows columns"]]:
@@ -209,94 +204,57 @@ class _Problem:
     def normal(self, x: Float[np.ndarray, " n"]) -> "_Normal":
         """Return the normal equations at x."""
         n_lens, bent = self.ends()
-        shared, gradient = np.zeros((n_lens + len(x) - bent,) * 2), np.zeros(n_lens + len(x) - bent)
+        square, gradient = np.zeros((len(x), len(x))), np.zeros(len(x))
         off = (x[:n_lens] - self.prior.mean) / self.sigma
         cost = float(off @ off)
         gradient[:n_lens] = off / self.sigma
-        shared[range(n_lens), range(n_lens)] = self.sigma**-2.0
+        square[range(n_lens), range(n_lens)] = self.sigma**-2.0
         if self.stiffness is not None:
-            gradient[n_lens:] = self.stiffness @ x[bent:]
-            cost += float(x[bent:] @ gradient[n_lens:])
-            shared[n_lens:, n_lens:] = self.stiffness
-        cross, poses, slopes = [], [], []
+            gradient[bent:] = self.stiffness @ x[bent:]
+            cost += float(x[bent:] @ gradient[bent:])
+            square[bent:, bent:] = self.stiffness
         for index, (row, weight) in enumerate(zip(self.rows, self.weights, strict=True)):
             offsets, jacobian = self.seen(x, index)
-            factor = np.repeat(np.sqrt(weight), 2) / self.noise
-            values, jacobian = offsets.ravel() * factor, jacobian * factor[:, None]
-            up = np.asarray(cv2.Rodrigues(x[n_lens + 6 * index :][:3])[0])[:, 2]
-            lift = (jacobian[:, -3:] @ up).reshape(-1, 2, 1)  # derivative by a corner's own height
-            square, mixed = jacobian.T @ jacobian, row.T @ (lift * jacobian.reshape(len(row), 2, -1)).sum(1)
-            shared[:n_lens, :n_lens] += square[:n_lens, :n_lens]
-            shared[n_lens:, :n_lens] += mixed[:, :n_lens]
-            shared[n_lens:, n_lens:] += row.T @ (row * (lift**2).sum(1))
-            both = jacobian.T @ values
-            gradient += np.append(both[:n_lens], row.T @ (lift[..., 0] * values.reshape(-1, 2)).sum(1))
+            factor, own = np.repeat(np.sqrt(weight), 2) / self.noise, self.numbers(index)
+            up = np.asarray(cv2.Rodrigues(x[own[n_lens:][:3]])[0])[:, 2]
+            by_c = (jacobian[:, -3:] @ up)[:, None] * np.repeat(row, 2, axis=0)
+            own = np.append(own, np.arange(bent, len(x)))
+            values, jacobian = offsets.ravel() * factor, np.hstack([jacobian, by_c]) * factor[:, None]
+            square[np.ix_(own, own)] += jacobian.T @ jacobian
+            gradient[own] += jacobian.T @ values
             cost += float(values @ values)
-            cross.append(np.vstack([square[:n_lens, n_lens:], mixed[:, n_lens:]]))
-            poses.append(square[n_lens:, n_lens:])
-            slopes.append(both[n_lens:])
-        shared[:n_lens, n_lens:] = shared[n_lens:, :n_lens].T
-        return _Normal(cost, shared, gradient, np.array(cross), np.array(poses), np.array(slopes))
+        return _Normal(cost, square, gradient)
 
 
-@dataclass(frozen=True)
-class _Normal:
-    """Gauss and Newton's quadratic of the sum of squared residuals (in sigmas) in lens and c, and in each pose."""
+class _Normal(NamedTuple):
+    """Gauss and Newton's quadratic of the sum of squared residuals (in sigmas)."""
 
     cost: float
-    shared: Float[np.ndarray, "m m"]  # half the second derivatives by lens and c
-    gradient: Float[np.ndarray, " m"]  # half the first derivatives
-    cross: Float[np.ndarray, "photos m 6"]
-    poses: Float[np.ndarray, "photos 6 6"]
-    slopes: Float[np.ndarray, "photos 6"]
+    square: Float[np.ndarray, "n n"]  # half the second derivatives
+    gradient: Float[np.ndarray, " n"]  # half the first derivatives
 
-    def without_poses(
-        self, damping: float = 0.0
-    ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, " m"], Float[np.ndarray, "photos 6 n"]]:
-        """Return second and first derivatives with the poses fitted to lens and c (Schur), and poses by
-        lens, c and 1."""
-        damped = self.poses + damping * self.poses * np.eye(6)
-        follow = np.linalg.solve(damped, np.concatenate([self.cross.transpose(0, 2, 1), self.slopes[..., None]], 2))
-        less = (self.cross @ follow).sum(0)
-        square = self.shared + damping * np.diag(np.diag(self.shared))
-        return square - less[:, :-1], self.gradient - less[:, -1], follow
-
-    def step(self, n_lens: int, damping: float) -> tuple[Float[np.ndarray, " n"], float]:
+    def step(self, damping: float) -> tuple[Float[np.ndarray, " n"], float]:
         """Return Levenberg and Marquardt's step of x, and by how much it would lower the cost of the quadratic.
 
         Raises:
             LinAlgError: no step at this damping.
         """
-        square, gradient, follow = self.without_poses(damping)
-        by_shared = -cho_solve(cho_factor(square), gradient)
-        by_pose = -follow[..., -1] - follow[..., :-1] @ by_shared
-        gain = -self.gradient @ by_shared - (self.slopes * by_pose).sum()
-        gain += damping * (np.diag(self.shared) @ by_shared**2 + np.einsum("pii,pi->", self.poses, by_pose**2))
-        return np.concatenate([by_shared[:n_lens], by_pose.ravel(), by_shared[n_lens:]]), float(gain)
-
-    def covariances(self, n_lens: int) -> Float[np.ndarray, "photos q q"]:
-        """Return the covariance of the lens and the pose of each photo."""
-        square, _, follow = self.without_poses()
-        inverse, found = np.linalg.inv(square), []
-        for pose, by_shared in zip(self.poses, follow[:, :, :-1], strict=True):
-            turn = np.vstack([np.eye(n_lens, len(square)), -by_shared])  # lens and pose by lens and c
-            covariance = turn @ inverse @ turn.T
-            covariance[n_lens:, n_lens:] += np.linalg.inv(pose)
-            found.append(covariance)
-        return np.array(found)
+        damped = damping * np.diag(self.square)
+        step = -cho_solve(cho_factor(self.square + np.diag(damped)), self.gradient)
+        return step, float(damped @ step**2 - self.gradient @ step)
 
 
 def _settled(problem: _Problem, x: Float[np.ndarray, " n"]) -> tuple[_Problem, Float[np.ndarray, " n"]]:
     """Return the optimum, with noise and weights that belong to it."""
-    n_lens, prior = problem.ends()[0], problem.prior
+    bent = problem.ends()[1]
     for _ in range(ROUNDS):
         before = problem.normal(x).cost
         x, normal = _descended(problem, x)
-        known = float(len(x) - len(normal.shared) + n_lens)
+        known = float(bent)
         if problem.stiffness is not None:  # c, as far as it is not held by its prior
-            spread = np.linalg.inv(normal.without_poses()[0])[n_lens:, n_lens:]
+            spread = np.linalg.inv(normal.square)[bent:, bent:]
             known += len(spread) - float((spread * problem.stiffness).sum())
-        problem = replace(problem.reweighted(x, known), sigma=prior.widened(x))
+        problem = replace(problem.reweighted(x, known), sigma=problem.prior.widened(x))
         if before - normal.cost < SAME:
             break
     return problem, x
@@ -307,7 +265,7 @@ def _descended(problem: _Problem, x: Float[np.ndarray, " n"]) -> tuple[Float[np.
     normal, damping, growth = problem.normal(x), 1e-7, 2.0
     for _ in range(STEPS):
         try:
-            step, expected = normal.step(problem.ends()[0], damping)
+            step, expected = normal.step(damping)
         except LinAlgError:
             damping, growth = damping * growth, 2 * growth
             continue
@@ -326,18 +284,16 @@ def _descended(problem: _Problem, x: Float[np.ndarray, " n"]) -> tuple[Float[np.
 
 def _weighed(problem: _Problem, x: Float[np.ndarray, " n"], sheet: Sheet) -> Waves:
     """Return the waves that the residuals ask for."""
-    n_lens, bent = problem.ends()
-    normal = replace(problem, stiffness=None).normal(x)
-    square, gradient, follow = normal.without_poses()
-    cost = normal.cost - float((normal.slopes * follow[..., -1]).sum())
-    back = np.concatenate([np.zeros(n_lens), -x[bent:]])  # to the flat sheet
-    cost, gradient = cost + 2 * gradient @ back + back @ square @ back, gradient + square @ back
-    onto = np.linalg.solve(square[:n_lens, :n_lens], np.column_stack([gradient[:n_lens], square[:n_lens, n_lens:]]))
-    cost -= float(gradient[:n_lens] @ onto[:, 0])
-    reduced = gradient[n_lens:] - square[n_lens:, :n_lens] @ onto[:, 0]
-    curvature = square[n_lens:, n_lens:] - square[n_lens:, :n_lens] @ onto[:, 1:]
+    bent = problem.ends()[1]
+    cost, square, gradient = replace(problem, stiffness=None).normal(x)
+    c, mixed = x[bent:], square[:bent, bent:]
+    fitted = np.linalg.solve(square[:bent, :bent], np.column_stack([gradient[:bent], mixed]))  # all else to each c
+    reduced = gradient[bent:] - mixed.T @ fitted[:, 0]
+    curvature = square[bent:, bent:] - mixed.T @ fitted[:, 1:]
+    cost += c @ curvature @ c - 2 * reduced @ c - gradient[:bent] @ fitted[:, 0]  # at c = 0, the flat sheet
     n = 2 * sum(float(weight.sum()) for weight in problem.weights) - bent
-    return weigh_waves(sheet, reduced, curvature, float(cost), max(n, 1.0), FINEST_NOISE / problem.noise)
+    finest = FINEST_NOISE / problem.noise
+    return weigh_waves(sheet, reduced - curvature @ c, curvature, float(cost), max(n, 1.0), finest)
 
 
 def _noise(distances: Float[np.ndarray, " n"], n_unknowns: float, are_edges: bool) -> float:

@@ -13,7 +13,7 @@ from calibration.board.lattice import find_lattices, flat_view
 from calibration.board.placement import place, placed_markers
 from calibration.board.sheet_edges import find_edges
 from capture.checks.robust import cauchy
-from capture.photos.photo import Photo, encode_srgb, read_photo
+from capture.photos.photo import Photo, encode_srgb, read_photo, smaller
 
 Grey = UInt8[np.ndarray, "_ _"]  # height, width; a reduced copy may stand beside the photo in one signature
 Markers = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 4 2"]]
@@ -34,9 +34,8 @@ NEWTON_STEPS = 5  # to the saddle point; the last moves it by less than 0.001 px
 FARTHEST_SADDLE = 0.5  # half windows between the corner and its saddle point: beyond, it belongs to something else
 SMOOTH_FROM = {3: 20, 2: 12}  # fewest corners for a cubic, a quadratic to separate lens distortion from wrong corners
 STRAY = {3: 0.06, 2: 0.08, 0: 0.25}  # of the spacing: how far a corner may be off that, and off no model of distortion
-MOST_PHOTOS = 8  # evenly chosen: corners average out, and each photo is read whole
-FEWEST_ALIKE = 3  # photos that show a corner at one place
-ALIKE_PX = 1.0  # from their median, at any size: corners are found within a tenth of a pixel
+MOST_PHOTOS = 8  # evenly chosen: each is read whole, and more change the median little
+FEWEST_ALIKE = 3  # photos, whose median leaves out what one of them hides
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,9 @@ def _by_lattice(grey: Grey, board: Board, allow_part: bool, enough: float) -> Co
     if best is None:
         return None
     view = _flat_view(best.pixels, best.points[:, :2], board.square_mm)
-    return best if view is None else replace(best, pixels=_saddles(grey, best.pixels, view[1], _clear_share(board)))
+    # Around a corner it is plain to the marker, or half way to the next corner.
+    share = min(SADDLE_WIDEST, TO_THE_MARKER * (1 - board.marker_mm / board.square_mm) / 2)
+    return best if view is None else replace(best, pixels=_saddles(grey, best.pixels, view[1], share))
 
 
 def grey_of(photo: Photo) -> Grey:
@@ -138,7 +139,8 @@ def _placed(
         points = placement.board.points()[index[order]]
         pixels = (lattice.pixels[placement.used[order]] + 0.5) / scale - 0.5
         good = _fits_the_rest(pixels, points[:, :2], board.square_mm)
-        if good.sum() >= max(FEWEST_CORNERS, MOSTLY_GOOD * len(good)) and not _is_line(points[good]):
+        spans_plane = np.linalg.matrix_rank(points[good, :2] - points[good, :2].mean(0), tol=1e-6) == 2
+        if good.sum() >= max(FEWEST_CORNERS, MOSTLY_GOOD * len(good)) and spans_plane:
             yield Corners(pixels[good], points[good], placement.board, placement.is_placed)
 
 
@@ -174,13 +176,6 @@ def read_markers(grey: Grey, dictionary: str) -> Markers:
     return np.array(list(read), int), np.array(list(read.values())).reshape(-1, 4, 2)
 
 
-def _clear_share(board: Board) -> float:
-    """Return the plain distance around a corner in squares: to the marker, or half way to the next corner."""
-    if board.kind == "checkerboard":
-        return SADDLE_WIDEST
-    return min(SADDLE_WIDEST, TO_THE_MARKER * (1 - board.marker_mm / board.square_mm) / 2)
-
-
 # --- saddle points ---------------------------------------------------------------------------------------------------
 
 
@@ -194,9 +189,12 @@ def _saddles(
     because a corner looks the same after half a turn under any tone curve.
     """
     reach = np.maximum(share * spacing, SADDLE_SMALLEST)
-    window, corner = _blurred_part(
-        grey, pixels, 2 * reach.max(), max(BLUR_SHARE * float(np.median(spacing)), BLUR_SMALLEST)
-    )
+    blur = max(BLUR_SHARE * float(np.median(spacing)), BLUR_SMALLEST)
+    margin = 2 * reach.max() + 4 * blur
+    corner = np.maximum(np.floor(pixels.min(0) - margin), 0).astype(int)
+    end = np.ceil(pixels.max(0) + margin).astype(int)
+    part = grey[corner[1] : end[1] + 1, corner[0] : end[0] + 1].astype(np.float32)
+    window = np.asarray(cv2.GaussianBlur(part, (0, 0), blur))
     steps = np.linspace(-1, 1, SADDLE_SAMPLES)
     x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
     weight = np.exp(-(x**2 + y**2) / (2 * WEIGHT_WIDTH**2))
@@ -217,16 +215,6 @@ def _saddles(
     return np.where(is_saddle[:, None], at + corner, pixels)
 
 
-def _blurred_part(
-    grey: Grey, pixels: Float[np.ndarray, "n 2"], margin: float, blur: float
-) -> tuple[Float32[np.ndarray, "rows columns"], Float[np.ndarray, "2"]]:
-    """Return the blurred brightness around the corners, and the first pixel of that part."""
-    first = np.maximum(np.floor(pixels.min(0) - margin - 4 * blur), 0).astype(int)
-    last = np.ceil(pixels.max(0) + margin + 4 * blur).astype(int) + 1
-    part = grey[first[1] : last[1], first[0] : last[0]].astype(np.float32)
-    return np.asarray(cv2.GaussianBlur(part, (0, 0), blur)), first.astype(np.float64)
-
-
 # --- common ----------------------------------------------------------------------------------------------------------
 
 
@@ -235,15 +223,8 @@ def reduced(grey: Grey, size: int) -> tuple[Grey, float]:
 
     Pixel centres map as (p + 0.5) * factor - 0.5.
     """
-    factor = min(1.0, size / max(grey.shape))
-    if factor == 1.0:
-        return grey, 1.0
-    shape = (round(grey.shape[1] * factor), round(grey.shape[0] * factor))
-    return np.asarray(cv2.resize(grey, shape, interpolation=cv2.INTER_AREA)), shape[0] / grey.shape[1]
-
-
-def _is_line(points: Float[np.ndarray, "n 3"]) -> bool:
-    return bool(np.linalg.matrix_rank(points[:, :2] - points[:, :2].mean(0), tol=1e-6) < 2)
+    image = smaller(grey, size)
+    return image, image.shape[1] / grey.shape[1]
 
 
 def _fits_the_rest(
@@ -292,55 +273,26 @@ def _smooth(values: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], d
     return fitted
 
 
-def under_the_flashlight(lit: Sequence[Path], board: AnyBoard) -> tuple[Path, Grey, float | None, Corners] | None:
-    """Return a photo's path, brightness and focal length by EXIF, with the corners that most photos agree on.
+def under_the_flashlight(lit: Sequence[Path], board: AnyBoard) -> tuple[Grey, float | None, Corners] | None:
+    """Return what photos under the flashlight usually show, a focal length by EXIF, and the corners seen in it.
 
-    For a tripod without a photo of the board in room light. All photos are from one place, so each corner is seen in
-    about one pixel. Shadows and occluders put some of them off: the median over the photos does not follow.
+    For a tripod without a photo of the board in room light. All photos are from one place: shadows and occluders move,
+    and the median over the photos has none.
 
-    None where fewer than FEWEST_ALIKE photos show the board at one place.
+    None where there are fewer than FEWEST_ALIKE photos, or they do not show the board.
     """
     chosen = [lit[i] for i in np.unique(np.linspace(0, len(lit) - 1, MOST_PHOTOS).round().astype(int))] if lit else []
-    best: tuple[Path, Grey, float | None, Corners] | None = None
-    found: list[Corners] = []
+    if len(chosen) < FEWEST_ALIKE:
+        return None
+    greys, focal = [], None
     for path in chosen:
         photo = read_photo(path)
-        grey = grey_of(photo)
-        corners = find_board(grey, board)
-        if corners is None or not corners.is_placed or corners.across is not None:
-            continue
-        found.append(corners)
-        if best is None or len(corners.pixels) > len(best[3].pixels):
-            best = path, grey, photo.focal_35mm, corners
-    if best is None:
+        greys.append(grey_of(photo))
+        focal = focal or photo.focal_35mm
+    stack = np.stack(greys)
+    stack.partition(len(stack) // 2, axis=0)
+    usual = stack[len(stack) // 2]
+    corners = find_board(usual, board)
+    if corners is None or not corners.is_placed or corners.across is not None:
         return None
-    agreed = agreed_corners(found, best[3])
-    return None if agreed is None else (*best[:3], agreed)
-
-
-def agreed_corners(found: Sequence[Corners], first: Corners) -> Corners | None:
-    """Return the median place of each corner of `first` that FEWEST_ALIKE photos see near one place; None: too few."""
-    pixels, points = [], []
-    for point, pixel in zip(first.points, first.pixels, strict=True):
-        seen = np.array([place for one in found for place in _place_of(one, first, point, pixel)]).reshape(-1, 2)
-        if len(seen) < FEWEST_ALIKE:
-            continue
-        middle = np.median(seen, axis=0)
-        near = seen[np.linalg.norm(seen - middle, axis=1) < ALIKE_PX]
-        if len(near) >= FEWEST_ALIKE:
-            pixels.append(np.median(near, axis=0))
-            points.append(point)
-    if len(pixels) < FEWEST_CORNERS:
-        return None
-    return replace(first, pixels=np.array(pixels), points=np.array(points))
-
-
-def _place_of(one: Corners, first: Corners, point: np.ndarray, pixel: np.ndarray) -> list[np.ndarray]:
-    """Return where a photo sees a corner; a plain checkerboard may be numbered from the other end, then by place."""
-    if one.board != first.board:
-        return []
-    if one.board.turns_alike() < 4:
-        away = np.linalg.norm(one.pixels - pixel, axis=1)
-        return [one.pixels[int(away.argmin())]] if away.min() < 10 * ALIKE_PX else []
-    same = np.flatnonzero(np.linalg.norm(one.points - point, axis=1) < 1e-6)
-    return [one.pixels[int(same[0])]] if len(same) else []
+    return usual, focal, corners

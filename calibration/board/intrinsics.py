@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.optimize import least_squares
+from jaxtyping import Bool
 
 from calibration.board.board import AnyBoard, Blank
-from calibration.board.board_pose import CORNER_SIGMA, PoseSpread
-from calibration.board.bundle import Lens, Prior, Solution, opencv_lens, see, solve
+from calibration.board.board_pose import CORNER_SIGMA, PoseSpread, fit_pose, reprojected
+from calibration.board.bundle import Lens, Prior, Solution, opencv_lens, solve
 from calibration.board.corners import Corners
 from calibration.camera import Camera
 from capture.decode.exif import focal_in_pixels
@@ -57,17 +56,13 @@ class CameraFit:
 
     def pose_spread(self, index: int) -> PoseSpread:
         """How well the pose of a detection that is used, and the table under the sheet are known."""
-        sheet, waves = self.solution.sheet, self.solution.waves
-        table = np.diag([PAPER_MM**2, 0, 0]) + self._curl()
+        sheet, waves, board = self.solution.sheet, self.solution.waves, self.board
+        table = np.diag([PAPER_MM**2, 0, 0])
+        if isinstance(board, Blank):  # its edges may be curled
+            table = table + board.curl_mm**2 * np.diag([1.0, (2 / board.long_mm) ** 2, (2 / board.short_mm) ** 2])
         if sheet is not None:
             table = table + sheet.planes[waves.length] * waves.possible**2
         return PoseSpread(self.solution.pose_covariances[sum(self.used[:index])], table)
-
-    def _curl(self) -> Float[np.ndarray, "3 3"]:
-        """Covariance of the table's height over a blank sheet's edges, which may be curled, and of its slopes."""
-        if not isinstance(self.board, Blank):
-            return np.zeros((3, 3))
-        return self.board.curl_mm**2 * np.diag([1.0, (2 / self.board.long_mm) ** 2, (2 / self.board.short_mm) ** 2])
 
 
 PLAIN = Lens("three radial terms", False, (0, 1, 4), (K1_SIGMA, K2_SIGMA, K3_SIGMA))
@@ -206,30 +201,13 @@ def _held_out_error(lens: Lens, plain: Solution, photos: Sequence[Corners], size
             continue
         kept = [photo for photo, is_out in zip(photos, out, strict=True) if not is_out]
         solution = solve(kept, prior, plain.without(~out))
-        fitted = solution.x[: lens.n_numbers()]
+        camera = _camera(solution, size)
         for index in np.nonzero(out)[0]:
-            fitting, testing = (_half(solution.bent(photos[index]), parity) for parity in (0, 1))
-            seen = see(np.concatenate([fitted, _pose(fitting, fitted, lens, poses[index])]), lens, 0, testing)[0]
-            distances.append(np.linalg.norm(seen, axis=1))
+            sheet = solution.on_sheet(photos[index])
+            fitting, testing = (sheet.part(slice(parity, None, 2)) for parity in (0, 1))
+            view = fit_pose(poses[index], fitting, camera, CORNER_SIGMA)
+            distances.append(np.linalg.norm(reprojected(view.numbers, testing, camera)[0], axis=1))
     return float(np.median(np.concatenate(distances)))
-
-
-def _pose(
-    photo: Corners, numbers: Float[np.ndarray, " lens"], lens: Lens, start: Float[np.ndarray, "6"]
-) -> Float[np.ndarray, "6"]:
-    """Fit the pose of one photo for a known lens."""
-
-    def offsets(pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, " m"]:
-        return see(np.concatenate([numbers, pose]), lens, 0, photo)[0].ravel()
-
-    def slope(pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "m 6"]:
-        return see(np.concatenate([numbers, pose]), lens, 0, photo)[1][:, -6:]
-
-    return least_squares(offsets, start, slope, x_scale="jac", loss="cauchy", f_scale=CORNER_SIGMA).x
-
-
-def _half(photo: Corners, parity: int) -> Corners:
-    return photo.part(slice(parity, None, 2))
 
 
 def _prior(size: tuple[int, int], focal_35mm: float | None, focal_sigma: float, lens: Lens = PLAIN) -> Prior:

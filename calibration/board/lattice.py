@@ -2,11 +2,11 @@
 
 Brightness has a saddle point where four squares meet. Dark and light change places between neighbouring corners, so
 the sign of the Hessian changes. This sign change and the two edges that cross in a corner distinguish a print from
-clutter. Points are joined where the picture has an edge between them. A lattice grows over these joints, first by
-squares, then by single corners, then across gaps. Oblique views and strong distortion therefore need no model.
+clutter. Points are joined where the picture has an edge between them. A lattice grows from a square over these joints,
+corner by corner, then across gaps. Oblique views and strong distortion therefore need no model.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -25,7 +25,6 @@ CLEAR_EDGE = 4.0  # grey levels between the two sides, mean: above noise and gra
 MOST_SEEDS = 300  # lattices begun; one that begins on the print reaches its edge
 STARTS_PER_SEED = 6
 SHARPEST = float(np.sin(np.radians(6.0)))  # of a square's corners; 80 degrees of tilt leave 20
-FARTHEST_STEP = 1.4  # sum over both corners of how far the next step is off the last, in oblique close-ups
 OFF_STEP, OFF_LINE = 0.45, 0.25  # of a step ahead, and of one across: how far the next corner of a row may be off
 OFF_STRAIGHT = 0.25  # of a step: how far a corner may be off where its row goes on; strong fisheyes bend by that much
 MOST_PERSPECTIVE = 1.6  # between two steps of a row that stays in front of the camera for some more
@@ -33,11 +32,9 @@ MOST_BRIDGED, MOST_GAPS, WIDEST_GAP = 4, 3, 3  # lattices, rounds, cells
 FEWEST_BEFORE_GAP = 9  # corners that determine a flat view well enough
 THINNEST = 1e-3  # cells or pixels, rms times root of the count: below, everything lies on one line
 OFF_VIEW = 0.15  # of a step: from where the flat view has it
-FIRST_SIDES = ((0, 0, 1, 0, 0, -1), (0, 1, 1, 1, 0, 1), (0, 0, 0, 1, -1, 0), (1, 0, 1, 1, 1, 0))  # and ways out
 
 Cell = tuple[int, int]  # column and row
 Cells = dict[Cell, int]  # the point at each of them
-Side = tuple[Cell, Cell, tuple[int, int]]  # two neighbours, and the way out of the square that they are a side of
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,95 +153,39 @@ def _is_convex(at: list[complex], *corners: int) -> bool:
 
 
 def _grow(cells: Cells, at: list[complex], joined: list[list[int]]) -> Cells:
-    """Add all corners reachable over squares, then over single edges and further squares; `at` holds complex pixels."""
-    where = {index: cell for cell, index in cells.items()}
-    sides: list[Side] = [((i, j), (k, m), (di, dj)) for i, j, k, m, di, dj in FIRST_SIDES]
-    while sides:
-        _add_squares(cells, where, sides, at, joined)
-        sides = _sides(cells, _add_corners(cells, where, at, joined))
+    """Add all corners that continue two corners of a row; each is joined to the nearer of the two."""
+    taken, before = set(cells.values()), 0
+    while before < len(cells):
+        before = len(cells)
+        for cell, index in list(cells.items()):
+            steps = {}
+            for way in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+                behind = cells.get((cell[0] - way[0], cell[1] - way[1]))
+                if behind is not None:
+                    steps[way] = at[index] - at[behind]
+            for way, step in steps.items():
+                beyond = (cell[0] + way[0], cell[1] + way[1])
+                across = steps.get((way[1], way[0])) or steps.get((-way[1], -way[0]))
+                if beyond in cells or across is None:
+                    continue
+                best = _next_corner(at[index] + step, step, across, [k for k in joined[index] if k not in taken], at)
+                if best is not None:
+                    cells[beyond] = best
+                    taken.add(best)
     return cells
 
 
-def _sides(cells: Cells, corners: Iterable[Cell]) -> list[Side]:
-    """Return the sides of squares that begin at these corners, with every direction of growth."""
-    sides: list[Side] = []
-    for i, j in corners:
-        for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            beside = (i + dj, j + di), (i - dj, j - di)
-            sides += [((i, j), neighbour, (di, dj)) for neighbour in beside if neighbour in cells]
-    return sides
-
-
-def _add_squares(
-    cells: Cells,
-    where: dict[int, Cell],
-    open_sides: list[Side],
-    at: list[complex],
-    joined: list[list[int]],
-) -> None:
-    """Add squares beyond these sides (two cells and the growth direction), then beyond the sides of the new squares."""
-    while open_sides:
-        one, other, (di, dj) = open_sides.pop(0)
-        beyond = (one[0] + di, one[1] + dj), (other[0] + di, other[1] + dj)
-        if beyond[0] in cells and beyond[1] in cells:
-            continue
-        inside = cells.get((one[0] - di, one[1] - dj)), cells.get((other[0] - di, other[1] - dj))
-        found = _next_square(cells[one], cells[other], inside, at, joined)
-        if found is None or any(
-            cells.get(cell, i) != i or where.get(i, cell) != cell for cell, i in zip(beyond, found, strict=True)
-        ):
-            continue
-        for cell, index in zip(beyond, found, strict=True):
-            cells[cell], where[index] = index, cell
-        open_sides.append((*beyond, (di, dj)))
-        open_sides += [(one, beyond[0], (one[0] - other[0], one[1] - other[1]))]
-        open_sides += [(other, beyond[1], (other[0] - one[0], other[1] - one[1]))]
-
-
-def _add_corners(cells: Cells, where: dict[int, Cell], at: list[complex], joined: list[list[int]]) -> list[Cell]:
-    """Add corners that continue two corners of a row; each is joined to the nearer of the two."""
-    added = []
-    for cell, index in list(cells.items()):
-        steps = {}
-        for way in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            behind = cells.get((cell[0] - way[0], cell[1] - way[1]))
-            if behind is not None:
-                steps[way] = at[index] - at[behind]
-        for way, step in steps.items():
-            beyond = (cell[0] + way[0], cell[1] + way[1])
-            across = steps.get((way[1], way[0])) or steps.get((-way[1], -way[0]))
-            if beyond in cells or across is None:
-                continue
-            area = (step.conjugate() * across).imag
-            best, least = None, np.inf
-            for candidate in joined[index]:
-                offset = at[candidate] - at[index] - step
-                ahead, aside = (offset.conjugate() * across).imag / area, (step.conjugate() * offset).imag / area
-                if candidate not in where and abs(ahead) < OFF_STEP and abs(aside) < OFF_LINE and abs(offset) < least:
-                    best, least = candidate, abs(offset)
-            if best is not None:
-                cells[beyond], where[best] = best, beyond
-                added.append(beyond)
-    return added
-
-
-def _next_square(
-    one: int, other: int, inside: tuple[int | None, int | None], at: list[complex], joined: list[list[int]]
-) -> tuple[int, int] | None:
-    """The two corners that complete a square on this side, away from the inside; if several do, the likeliest."""
+def _next_corner(
+    place: complex, step: complex, across: complex, candidates: list[int], at: list[complex]
+) -> int | None:
+    """Return the candidate nearest to where the next corner of a row is expected; None if none is near."""
+    area = (step.conjugate() * across).imag
     best, least = None, np.inf
-    if inside[0] is None or inside[1] is None:
-        return None
-    steps = at[one] - at[inside[0]], at[other] - at[inside[1]]
-    for first in joined[one]:
-        for second in joined[other]:
-            if second == one or first == other or second not in joined[first]:
-                continue
-            off = abs(at[first] - at[one] - steps[0]) / abs(steps[0]) + abs(at[second] - at[other] - steps[1]) / abs(
-                steps[1]
-            )
-            if off < min(least, FARTHEST_STEP) and _is_convex(at, one, first, second, other):
-                best, least = (first, second), off
+    for candidate in candidates:
+        offset = at[candidate] - place
+        ahead, aside = (offset.conjugate() * across).imag / area, (step.conjugate() * offset).imag / area
+        if abs(ahead) < OFF_STEP and abs(aside) < OFF_LINE and abs(offset) < least:
+            best, least = candidate, abs(offset)
     return best
 
 
@@ -259,22 +200,21 @@ def _bridge(cells: Cells, points: SaddlePoints, at: list[complex], joined: list[
         places = lattice.completed(first, size)
         across, down = np.gradient(places, axis=0), np.gradient(places, axis=1)
         near = cKDTree(points.pixels).query(places.reshape(-1, 2))[1].reshape(size)
-        where = {index: cell for cell, index in cells.items()}
-        added = []
+        taken, before = set(cells.values()), len(cells)
         for i, j in np.ndindex(*size.tolist()):
             cell, index = (int(i + first[0] + low[0]), int(j + first[1] + low[1])), int(near[i, j])
             basis = np.stack([across[i, j], down[i, j]], 1)
-            if cell in cells or index in where or abs(np.linalg.det(basis)) < 1:
+            if cell in cells or index in taken or abs(np.linalg.det(basis)) < 1:
                 continue
             off = np.linalg.solve(basis, points.pixels[index] - places[i, j])
             light = np.linalg.solve(basis, points.light[index])
             is_light = lattice.first_is_light == ((cell[0] - low[0] + cell[1] - low[1]) % 2 == 0)
             if np.abs(off).max() < OFF_VIEW and (light[0] * light[1] > 0) == is_light:
-                cells[cell], where[index] = index, cell
-                added.append(cell)
-        if not added:
+                cells[cell] = index
+                taken.add(index)
+        if len(cells) == before:
             return
-        _add_squares(cells, where, _sides(cells, added), at, joined)
+        _grow(cells, at, joined)
 
 
 def _straight(cells: Cells, at: list[complex], joined: list[list[int]]) -> Cells:

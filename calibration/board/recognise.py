@@ -1,7 +1,7 @@
 """Recognise the board in the photos without a description, from marker numbers or from the grid of corners."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,21 +33,10 @@ MANY_CORNERS = 200  # ends the search: more than most prints have
 ENOUGH_PHOTOS = 5  # looked at per question
 
 
-@dataclass(frozen=True)
-class BoardGuess:
-    """A recognised board, and a sentence for the user about what was assumed."""
-
-    board: Board
-    note: str
-
-
-def guess_board(photos: Sequence[Grey]) -> BoardGuess | None:
+def guess_board(photos: Sequence[Grey]) -> Board | None:
     """Return the board seen in these photos, with assumed lengths in mm; None if none is recognised."""
     photos = photos[:ENOUGH_PHOTOS]
-    board = _guess_charuco(photos) or _guess_checkerboard(photos)
-    if board is None:
-        return None
-    return BoardGuess(board, f"No board was named; the photos show {board.spec()}, whose millimetres are assumed.")
+    return _guess_charuco(photos) or _guess_checkerboard(photos)
 
 
 def board_finder(spec: str | None) -> Callable[[Path], bool]:

@@ -16,7 +16,7 @@ from scipy import ndimage
 from calibration.board.board import Blank
 from capture.checks.robust import cauchy
 from capture.decode.exif import ORDINARY_FOCAL_35MM, focal_in_pixels
-from capture.photos.photo import decode_srgb
+from capture.photos.photo import decode_srgb, smaller
 
 Light = Float32[np.ndarray, "height width"]
 Quad = Float[np.ndarray, "4 2"]
@@ -69,9 +69,8 @@ def find_edges(grey: UInt8[np.ndarray, "height width"], blank: Blank) -> SheetEd
 
     Its two ends look alike: the long side points to the right.
     """
-    scale = min(1.0, SEARCH_PX / max(grey.shape))
-    size = (round(grey.shape[1] * scale), round(grey.shape[0] * scale))
-    small = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA)) if scale < 1 else grey
+    small = smaller(grey, SEARCH_PX)
+    size = small.shape[::-1]
     light = decode_srgb(small)
     best: tuple[float, SheetEdges] | None = None
     for quad in _distinct(_quads(small)):

@@ -61,7 +61,7 @@ def _names_a_board(folder: Path) -> bool:
         CaptureError: it is wrong.
     """
     settings = load_settings(folder)
-    return settings.board is not None or any(role == BOARD for role, _ in settings.roles)
+    return settings.board is not None or BOARD in settings.roles
 
 
 def _name_in(folder: Path, lights: Path | None) -> str:

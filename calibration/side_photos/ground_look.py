@@ -55,14 +55,12 @@ def stood_there(
     inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     if inner.sum() < 50:
         return True
-    one, other = (_fine(values)[inner] for values in (np.log(np.maximum(rgb.mean(-1), DARKEST)), lit))
+    logs = (values.astype(np.float32) for values in (np.log(np.maximum(rgb.mean(-1), DARKEST)), lit))
+    one, other = (
+        (cv2.GaussianBlur(log, (0, 0), FINE) - cv2.GaussianBlur(log, (0, 0), 4 * FINE))[inner] for log in logs
+    )
     size = float(np.sqrt((one**2).sum() * (other**2).sum()))
     return size <= 0 or float((one * other).sum()) / size > SAME_TEXTURE
-
-
-def _fine(log: np.ndarray) -> np.ndarray:
-    log = log.astype(np.float32)
-    return cv2.GaussianBlur(log, (0, 0), FINE) - cv2.GaussianBlur(log, (0, 0), 4 * FINE)
 
 
 def ground_look(

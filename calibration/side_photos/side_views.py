@@ -7,6 +7,7 @@ Camera and ground of the tripod stay as they are.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -17,22 +18,19 @@ from calibration.board.board import Board
 from calibration.board.board_pose import (
     CLEAR_WIN,
     CORNER_SIGMA,
-    FINEST_SIGMA,
-    FOCUS_SIGMA,
     SAME_LENS,
     WORST_MISFIT,
     board_views,
-    fit_pose_and_focus,
+    pose_covariance,
+    reprojected,
     unexplained,
 )
 from calibration.board.corners import FEWEST_CORNERS, Corners, find_board, grey_of
-from calibration.camera import Camera, project_from
 from calibration.ground.ground_field import fit_ground_field
 from calibration.ground.ground_shadows import find_shadows
 from calibration.ground.shadow_reach import NEAREST, most_height
 from calibration.lights.ground_cells import beyond_ends, ground_ends, ground_points
 from calibration.outlines.metric_cues import MetricCues
-from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.side_photos.ground_look import TripodView, stood_there
 from calibration.side_photos.silhouette import find_silhouette, possible_region, share_shown
@@ -49,59 +47,42 @@ GROWN = 0.4  # of the silhouette's extent: before lights are known, thin and hig
 LIFTED = 0.15  # of the way to the camera: points amid the object
 
 
-@dataclass(frozen=True)
-class SidePose:
-    """Where a photo was taken from, with which focal length, and how well that is known."""
+def side_pose(
+    corners: Corners, tripod: PosedCamera, about: Float[np.ndarray, "n 3"]
+) -> tuple[PosedCamera, float] | str:
+    """Return the posed camera of one photo, and one sigma (px) of where a point of the object is seen.
 
-    camera: Camera  # the tripod's lens, its focal length scaled
-    world_from_camera: Pose
-    rms_px: float
-    sigma_px: float  # one sigma of where a point of the object is seen
-
-
-def side_pose(corners: Corners, camera: Camera, about: Float[np.ndarray, "n 3"]) -> SidePose | str:
-    """Return the pose of one photo; or a sentence that says why there is none.
+    Or a sentence that says why there is none. The lens is the tripod's, its focal length scaled.
 
     Args:
         corners: of the board in this photo, world mm.
-        camera: the tripod's, of the same pixel size.
+        tripod: of photos of the same pixel size.
         about: world points of the object, where the pose must be well known.
     """
+    camera = tripod.camera
     if len(corners.pixels) < FEWEST_CORNERS or not corners.is_placed:
         return (
             f"{len(corners.pixels)} corners of the board are seen, {FEWEST_CORNERS} that tell its place are needed. "
             "Keep object and board in view"
         )
-    views = board_views(corners, camera)
+    views = board_views(corners, camera, is_refocused=True)
     if not views:
         return unexplained(corners, camera)
-    fits = [fit_pose_and_focus(view.camera_from_world, corners, camera) for view in views]
-    fits.sort(key=lambda fit: fit.cost)
-    best = fits[0]
-    rms = float(np.sqrt((best.fun[:-1].reshape(-1, 2) ** 2).sum(1).mean()))
-    limit = WORST_MISFIT * max(camera.width, camera.height)
-    if rms > limit:
-        return f"the board's corners are {rms:.1f} px off, at most {limit:.1f} px expected: is the photo blurred?"
-    if len(fits) > 1 and 2 * (fits[1].cost - best.cost) / max(CORNER_SIGMA, rms) ** 2 < CLEAR_WIN:
+    best, limit = views[0], WORST_MISFIT * max(camera.width, camera.height)
+    if best.rms() > limit:
+        return (
+            f"the board's corners are {best.rms():.1f} px off, at most {limit:.1f} px expected: is the photo blurred?"
+        )
+    if len(views) > 1 and (views[1].cost - best.cost) / max(CORNER_SIGMA, best.rms()) ** 2 < CLEAR_WIN:
         return "the board is seen too small or too steeply from above to tell the camera's place. Come nearer and lower"
-    pose = Pose(np.asarray(cv2.Rodrigues(best.x[:3])[0]), best.x[3:6]).inverse()
-    found = replace(camera, fx=camera.fx * float(np.exp(best.x[6])), fy=camera.fy * float(np.exp(best.x[6])))
-    sigma = _sigma(best, rms, found, about)
+    zoom = float(np.exp(best.numbers[6]))
+    found = replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
+    by_place = reprojected(best.numbers, Corners(np.zeros((len(about), 2)), about, corners.board), camera)[1][:, :7]
+    variance = np.einsum("ij,jk,ik->i", by_place, pose_covariance(best, corners, camera), by_place)
+    sigma = float(np.sqrt(variance.reshape(-1, 2).sum(1).mean()))
     if sigma > WORST_SIGMA * max(camera.width, camera.height):
         return f"the camera's place is uncertain by {sigma:.1f} px at the object. Show more of the board, and nearer"
-    return SidePose(found, pose, rms, sigma)
-
-
-def _sigma(fit, rms: float, camera: Camera, about: Float[np.ndarray, "n 3"]) -> float:
-    """Return one sigma, px, of where the points are seen: corner noise, focal length and the tripod lens's error."""
-    noise = max(FINEST_SIGMA, rms)
-    rows = fit.jac.copy()
-    rows[-1, -1] = noise / FOCUS_SIGMA
-    covariance = np.linalg.pinv(rows.T @ rows) * noise**2
-    _, full = project_from(about, fit.x[:6], camera.matrix(), np.array(camera.distortion), camera.fisheye)
-    jacobian = np.column_stack([full[:, :6], camera.fx * full[:, 6] + camera.fy * full[:, 7]])
-    variance = np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian)
-    return float(np.sqrt(variance.reshape(-1, 2).sum(1).mean()))
+    return replace(tripod, camera=found, world_from_camera=best.camera_from_world.inverse()), sigma
 
 
 @dataclass(frozen=True)
@@ -118,16 +99,6 @@ class SideResult:
 
 
 @dataclass(frozen=True)
-class _Whereabouts:
-    """Where the object can be, as its silhouette from the tripod says; world."""
-
-    outline: Float[np.ndarray, "n 3"]  # where rays through its pixels meet the ground
-    reach: Float[np.ndarray, "rays 3"]  # where rays that may meet it end
-    top: float  # above the ground
-    foot: Float[np.ndarray, "3"]
-
-
-@dataclass(frozen=True)
 class TripodObject:
     """What the tripod's photos say of the object before any light is known."""
 
@@ -136,24 +107,37 @@ class TripodObject:
     mask: Bool[np.ndarray, "height width"]  # the object, on any reduced grid of the photos
     lit: Float[np.ndarray, "height width"]  # mean log brightness under the flashlight, on that grid
 
+    @cached_property
     def outline(self) -> Float[np.ndarray, "n 3"]:
-        """Return the world points where rays through the object's pixels meet the ground."""
+        """The world points where rays through the object's pixels meet the ground."""
         points, down = ground_points(self.posed_camera.resized(self.mask.shape[1], self.mask.shape[0]))
         found = points[self.mask & down]
         return found[:: max(1, len(found) // OUTLINE_POINTS)]
 
+    @cached_property
     def reach(self) -> Float[np.ndarray, "n 3"]:
-        """Return where rays that may meet the object end: on the ground, or as far away as rays of the mask do."""
+        """Where rays that may meet the object end: on the ground, or as far away as rays of the mask do."""
         camera = self.posed_camera.resized(self.mask.shape[1], self.mask.shape[0])
         rows, columns = np.nonzero(self.mask)
         size = 2 * round(GROWN * max(np.ptp(rows), np.ptp(columns))) + 1
         grown = cv2.dilate(self.mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, [size] * 2))
         rim = np.argwhere(cv2.morphologyEx(grown, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8), borderValue=0) > 0)
         rays = camera.rays(rim[:, ::-1].astype(float))
-        _, farthest = camera.project_with_depth(self.outline())
+        _, farthest = camera.project_with_depth(self.outline)
         drop = camera.ground_height - camera.centre[2]
         depth = drop / np.minimum(rays[:, 2], drop / farthest.max())
         return camera.centre + depth[:, None] * rays
+
+    @cached_property
+    def top(self) -> float:
+        """The most height above the ground."""
+        return most_height(self.posed_camera.centre, self.outline, self.reach)
+
+    @cached_property
+    def foot(self) -> Float[np.ndarray, "3"]:
+        """The world point on the table where it stands."""
+        away = np.linalg.norm((self.outline - self.posed_camera.centre)[:, :2], axis=1)
+        return self.outline[away <= np.percentile(away, NEAREST)].mean(0)
 
 
 def side_views(paths: Sequence[Path], board: Board, on_sheet: OnSheet, seen: TripodObject) -> list[SideResult]:
@@ -165,15 +149,14 @@ def side_views(paths: Sequence[Path], board: Board, on_sheet: OnSheet, seen: Tri
     Raises:
         CaptureError: a photo cannot be read.
     """
-    outline = seen.outline()
-    if len(outline) == 0:
+    if len(seen.outline) == 0:
         reason = "no object stands out in the tripod's photos, so nothing tells where to look for it"
         return [SideResult(path.name, None, reason) for path in paths]
     reference = read_photo(seen.board_photo)
-    tripod, where = _tripod(reference, seen), _whereabouts(seen.posed_camera.centre, outline, seen.reach())
+    tripod = _tripod(reference, seen)
     results = []
     for path in paths:
-        found = _side_view(read_photo(path), reference, board, on_sheet, tripod, where)
+        found = _side_view(read_photo(path), reference, board, on_sheet, tripod, seen)
         view, reason = (None, found) if isinstance(found, str) else (found, "")
         results.append(SideResult(path.name, view, reason))
     return results
@@ -224,21 +207,13 @@ def _tripod(reference: Photo, seen: TripodObject) -> TripodView:
     return TripodView(seen.posed_camera, reference.rgb, hides)
 
 
-def _whereabouts(
-    eye: Float[np.ndarray, "3"], outline: Float[np.ndarray, "n 3"], reach: Float[np.ndarray, "rays 3"]
-) -> _Whereabouts:
-    away = np.linalg.norm(outline[:, :2] - eye[:2], axis=1)
-    foot = outline[away <= np.percentile(away, NEAREST)].mean(0)
-    return _Whereabouts(outline, reach, most_height(eye, outline, reach), foot)
-
-
 def _side_view(
     photo: Photo,
     reference: Photo,
     board: Board,
     on_sheet: OnSheet,
     tripod: TripodView,
-    where: _Whereabouts,
+    seen: TripodObject,
 ) -> SideView | str:
     camera, eye = tripod.posed_camera.camera, tripod.posed_camera.centre
     height, width = photo.rgb.shape[:2]
@@ -256,12 +231,12 @@ def _side_view(
     corners = find_board(grey_of(photo), board)
     if corners is None:
         return f"the board {board.spec()} was not found in it. Keep object and board in view, both in focus"
-    pose = side_pose(on_sheet(corners), camera, where.outline + LIFTED * (eye - where.outline))
-    if isinstance(pose, str):
-        return pose
-    view = PosedCamera(pose.camera, pose.world_from_camera, tripod.posed_camera.ground_height)
-    region = possible_region(view, where.reach, eye, where.top)
-    found = find_silhouette(photo.rgb, view, region, tripod, where.foot)
+    posed = side_pose(on_sheet(corners), tripod.posed_camera, seen.outline + LIFTED * (eye - seen.outline))
+    if isinstance(posed, str):
+        return posed
+    view, sigma = posed
+    region = possible_region(view, seen.reach, eye, seen.top)
+    found = find_silhouette(photo.rgb, view, region, tripod, seen.foot)
     if found is None:
         return "the object does not stand out from the table in it. Keep it in view, in even room light"
     if found.sure_outline() < LEAST_SURE:
@@ -269,10 +244,10 @@ def _side_view(
             f"only {found.sure_outline():.0%} of the object's outline is sure in it ({LEAST_SURE:.0%} needed): it "
             "looks like what lies behind it. Choose a side with a plainer background, in even room light"
         )
-    shown = share_shown(found, view, where.outline, eye, where.top)
+    shown = share_shown(found, view, seen.outline, eye, seen.top)
     if shown < LEAST_SHOWN:
         return (
             f"only {shown:.0%} of what the tripod saw of the object is found in it ({LEAST_SHOWN:.0%} needed): the "
             "rest looks like what lies behind it. Choose a side with a plainer background, in even room light"
         )
-    return SideView(photo.path.name, view, found.window, found.mask, found.sure, pose.sigma_px)
+    return SideView(photo.path.name, view, found.window, found.mask, found.sure, sigma)

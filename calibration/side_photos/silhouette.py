@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import binary_fill_holes, label
+from scipy.ndimage import binary_fill_holes, convolve1d, label
 
 from calibration.ground.min_cut import cheapest_region
 from calibration.posed_camera import PosedCamera
@@ -273,14 +273,10 @@ def _links(log: Float[np.ndarray, "height width 3"], look: GroundLook):
     out = []
     for axis in (1, 0):
         plain, other = np.diff(log, axis=axis), np.diff(look.residual, axis=axis)
-        known = np.minimum(*(np.take(look.known, np.arange(*ends), axis=axis) for ends in _pairs(log.shape[axis])))
+        known = look.known[:, 1:] & look.known[:, :-1] if axis else look.known[1:] & look.known[:-1]
         step = (np.where(known[..., None], other, plain) ** 2).sum(-1)
         out.append(LINK * np.exp(-step / (2 * step.mean())))
     return out
-
-
-def _pairs(count: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    return (0, count - 1), (1, count)
 
 
 def _colour_odds(log: np.ndarray, thing: np.ndarray, rest: np.ndarray) -> Float[np.ndarray, "height width"]:
@@ -292,19 +288,11 @@ def _colour_odds(log: np.ndarray, thing: np.ndarray, rest: np.ndarray) -> Float[
     for chosen in (thing, rest):
         cells = np.zeros((COLOURS,) * 3, np.float32)
         np.add.at(cells, tuple(index[chosen].T), 1.0)
-        cells = _blurred(cells)
+        for axis in range(3):
+            cells = convolve1d(cells, [0.25, 0.5, 0.25], axis, mode="nearest")
         counts.append(cells / max(cells.sum(), 1e-6) + 0.3 / COLOURS**3)
     odds = np.log(counts[0] / counts[1])
     return np.clip(odds[tuple(np.moveaxis(index, -1, 0))], -ANYTHING, ANYTHING)
-
-
-def _blurred(cells: Float[np.ndarray, "a b c"]) -> Float[np.ndarray, "a b c"]:
-    for axis in range(3):
-        pad = np.take(cells, [0, *range(cells.shape[axis]), cells.shape[axis] - 1], axis=axis)
-        n = cells.shape[axis]
-        before, here, after = (np.take(pad, np.arange(k, k + n), axis=axis) for k in range(3))
-        cells = 0.25 * before + 0.5 * here + 0.25 * after
-    return cells
 
 
 def _cut(odds: np.ndarray, links: list[np.ndarray], region: np.ndarray, favour: float) -> Bool[np.ndarray, "h w"]:

@@ -83,7 +83,8 @@ def _of_pair(
 ) -> list[Tangent]:
     start, end = (one.camera.centre for one in pair)
     base = end - start
-    middle = _middle(pair, outlines)
+    amid = [rays.mean(0) if len(rays) else np.array([0.0, 0.0, -1.0]) for rays in outlines]
+    middle = _nearest((start, end), (amid[0], amid[1]))  # which both see amid their silhouettes
     away = [float(np.linalg.norm(middle - eye)) for eye in (start, end)]
     if not all(len(rays) for rays in outlines) or np.linalg.norm(base) < SHORTEST_BASELINE * min(away):
         return []
@@ -107,12 +108,6 @@ def _of_pair(
         sigma = OUTLINE_PX * float(np.hypot(*(one.pixel(at) for one in pair)))
         found.append(Tangent(views, normal, sign * distance * (second - first), sigma))
     return found
-
-
-def _middle(pair: tuple[Silhouette, Silhouette], outlines: tuple[np.ndarray, np.ndarray]) -> Vector:
-    """Return the world point that both see amid their silhouettes."""
-    rays = [one.mean(0) if len(one) else np.array([0.0, 0.0, -1.0]) for one in outlines]
-    return _nearest((pair[0].camera.centre, pair[1].camera.centre), (rays[0], rays[1]))
 
 
 def _nearest(starts: tuple[Vector, Vector], rays: tuple[Vector, Vector]) -> Vector:
@@ -197,7 +192,9 @@ def odd_one_out(silhouettes: Sequence[Silhouette], names: Sequence[str]) -> tupl
     measured = (
         f"the object stands {least}{shift.length:.1f} mm from where {others} saw it, {MOVED_MM:g} mm may be{doubt}"
     )
-    if shift.length > max(OTHER_MM, OTHER_SHARE * _size(silhouettes)):
+    # about how large the object is, mm: the root of its area in the picture, at the ground's distance
+    sizes = [np.sqrt(one.mask.sum()) * one.pixel(one.camera.looked_at()) for one in silhouettes]
+    if shift.length > max(OTHER_MM, OTHER_SHARE * float(np.median(sizes))):
         measured += ": is it another object, or a board of another size?"
         return view, f"{measured} Photograph one object on one sheet, and move nothing on the table."
     return view, f"{measured}. Nothing on the table may move between views: photograph this view again."
@@ -233,20 +230,13 @@ def _moved(
 
 def _culprits(found: Sequence[Tangent], shifts: Sequence[Shift | None]) -> list[int]:
     """Return the views each of whose shifts makes all tangents agree about as well as that of any."""
-    rest = [
-        float(np.sum([(one.gap / one.sigma) ** 2 for one in found if view not in one.views]))
-        for view in range(len(shifts))
-    ]
-    explained = [value + _left(found, view, shifts[view]) for view, value in enumerate(rest)]
+    explained = []
+    for view, shift in enumerate(shifts):
+        moved = np.zeros(2) if shift is None else shift.mm
+        own = [one for one in found if view not in one.views or shift is not None]
+        gaps = [one.gap - (view in one.views) * _sign(one, view) * one.normal[:2] @ moved for one in own]
+        explained.append(sum((gap / one.sigma) ** 2 for gap, one in zip(gaps, own, strict=True)))
     return np.flatnonzero(np.array(explained) <= min(explained) + AS_GOOD).tolist()
-
-
-def _left(found: Sequence[Tangent], view: int, shift: Shift | None) -> float:
-    """Return chi-square of a view's own tangents after its shift."""
-    if shift is None:
-        return 0.0
-    own = [one for one in found if view in one.views]
-    return float(np.sum([((one.gap - _sign(one, view) * one.normal[:2] @ shift.mm) / one.sigma) ** 2 for one in own]))
 
 
 def _sign(tangent: Tangent, view: int) -> float:
@@ -268,12 +258,6 @@ def _shift(found: Sequence[Tangent], view: int, fewest: int) -> Shift | None:
     millimetres = np.array([one.gap for one in own])
     rest = millimetres - np.array([_sign(one, view) * one.normal[:2] @ mm for one in own])
     return Shift(mm, sigmas, float(np.sqrt((millimetres**2).mean())), float(np.sqrt((rest**2).mean())))
-
-
-def _size(silhouettes: Sequence[Silhouette]) -> float:
-    """Return about how large the object is, mm: the root of its area in the picture, at the ground's distance."""
-    sizes = [np.sqrt(one.mask.sum()) * one.pixel(one.camera.looked_at()) for one in silhouettes]
-    return float(np.median(sizes))
 
 
 # --- boards whose ends are alike -------------------------------------------------------------------------------------

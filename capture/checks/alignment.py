@@ -276,7 +276,7 @@ def board_rotation(board: PhotoStack, home: HomeView, rotation: Rotation) -> Flo
     if not np.isfinite(home.shift).all():
         return np.full(3, np.nan)
     lit = _only(brightness, _agreeing(texture, home.shift, view), view.cell_side)
-    return points.refined(texture, lit, 0, rotation.from_shift(home.shift), rotation)[0]
+    return points.refined(texture, lit, 0, rotation.from_shift(home.shift), rotation.homography)[0]
 
 
 def _agreeing(texture: Plane, shift: Shift, view: CommonView) -> Bool[np.ndarray, "rows columns"]:

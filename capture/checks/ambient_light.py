@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -22,7 +21,7 @@ from capture.checks.mixture import levels, usual_level
 from capture.checks.robust import cauchy, spread
 from capture.photos.channels import mean_of_channels
 from capture.photos.finding import Finding
-from capture.photos.photo import PhotoStack
+from capture.photos.photo import PhotoStack, smaller
 
 LONG_SIDE = 160  # px: shadows are larger than one of these
 DIM = 0.02  # usual brightness below which ratios are noise
@@ -83,9 +82,7 @@ def find_shadows(stack: PhotoStack, good: Sequence[bool], dark: PhotoStack | Non
 
 
 def _small(stack: PhotoStack) -> Float[np.ndarray, "photos rows columns"]:
-    scale = min(1.0, LONG_SIDE / max(stack.rgb.shape[1:3]))
-    size = (round(stack.rgb.shape[2] * scale), round(stack.rgb.shape[1] * scale))
-    return np.stack([mean_of_channels(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)) for rgb in stack.rgb])
+    return np.stack([mean_of_channels(smaller(rgb, LONG_SIDE)) for rgb in stack.rgb])
 
 
 def excess(shadows: Shadows) -> Float[np.ndarray, " photos"]:

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from capture.checks.alignment import (
-    ANCHORS,
     FEWEST_PHOTOS,
     SHOWN,
     CommonView,
@@ -24,9 +23,8 @@ from capture.checks.alignment import (
     densest,
     home_view,
 )
-from capture.checks.registration import is_lit, middle_of, moved_back, texture_of
+from capture.checks.registration import is_lit, moved_back
 from capture.checks.robust import column_quantile, column_spread
-from capture.photos.channels import mean_of_channels
 from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
 
@@ -59,10 +57,7 @@ EDGE_ENERGY = 2.0  # squared texture in a cell over the usual: hands gave 17 and
 HIGHLIGHT = 1.5  # brightness over that around: highlights gave 1.8 and more, hands 1.3 at most
 OFTEN = 0.5  # of the photos: what hides texture in more of them is light, not a hand
 SHARP = 0.85  # strength of a photo's own texture, over the usual; good photos gave 0.95 and more
-SOFT = 0.5  # likewise: shaken and unsharp photos had 0.2 and more, other scenes 0.9 and more
-COARSER = 8  # times smaller pictures, in which a blurred photo still shows what the others do
 SAME_VIEW = 0.5  # median slope of cells, from which two photos show the same from the same place
-SAME_SCENE = 0.2  # correlation of coarse texture: other scenes gave 0.08 at most, 8 px of blur 0.27 and more
 
 
 def edge_sharpness(brightness: list[Float[np.ndarray, "height width"]]) -> Float[np.ndarray, " photos"]:
@@ -112,7 +107,8 @@ def view_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack |
     view = home.alignment.view
     shown, steady = _cells(view, home.members)
     low = _low_contrast(_contrasts(view))
-    seen = [_usual_slope(one, steady) for one in shown]
+    known = [one[steady & np.isfinite(one)] for one in shown]
+    seen = [float(np.median(one)) if len(one) else np.nan for one in known]  # usual slope; NaN: no cell of them is lit
     moved, limits = _moved_photos(home, [not slope < SAME_VIEW for slope in seen], steady)
     sharpness = edge_sharpness(view.brightness)
     found = []
@@ -121,8 +117,7 @@ def view_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack |
         is_soft = k in low and not seen[k] > STILL_SHARP
         if (is_soft and home.lengths[k] < HARMLESS_PX) or ((is_soft or seen[k] < SAME_VIEW) and k not in moved):
             contrast = low.get(k, (seen[k], SAME_VIEW))
-            own = _own_strength(view, k)
-            found.append(_blurred_or_another(path, *contrast, own, _coarse_match(stack, indices, k)))
+            found.append(_blurred_or_another(path, *contrast, _own_strength(view, k)))
         elif k in moved:
             found.append(_moved(stack, path, float(home.lengths[k]), float(limits[k]), *home.fault(path)))
         elif (share := _hidden_share(view, k, shown[k], steady)) > COVERED:
@@ -137,12 +132,6 @@ def view_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack |
     found = [finding for finding in found if not (many and finding.kind == "covered")]
     left_out = {finding.photo for finding in found}
     return found + [one for one in board_findings(stack, indices, home) if one.photo not in left_out]
-
-
-def _usual_slope(shown: Float[np.ndarray, "rows columns"], steady: Bool[np.ndarray, "rows columns"]) -> float:
-    """The median over cells of how much of the common texture a photo shows; NaN where it shows none of them lit."""
-    known = shown[steady & np.isfinite(shown)]
-    return float(np.median(known)) if len(known) else np.nan
 
 
 def _moved_photos(
@@ -214,14 +203,13 @@ def _moved(stack: PhotoStack, path: Path, length: float, limit: float, kind: str
     return Finding(path, kind, text, length * to_file, limit * to_file, True)
 
 
-def _blurred_or_another(path: Path, contrast: float, limit: float, own: float, coarse: float) -> Finding:
+def _blurred_or_another(path: Path, contrast: float, limit: float, own: float) -> Finding:
     """Return the name of the fault that leaves little of the common texture in a photo.
 
     Args:
         own: strength of its own texture, over the usual.
-        coarse: correlation of its coarse texture with the common one.
     """
-    if (coarse < SAME_SCENE and own > SOFT) or (own > SHARP and contrast < MISSING):
+    if own > SHARP and contrast < MISSING:
         text = f"it shows {max(contrast, 0):.2f} times the texture that the others have in common, {limit:.2f} needed, "
         text += f"and has {own:.2f} times as much of its own: another object or another view"
         return Finding(path, "another scene", text, contrast, limit, True)
@@ -324,20 +312,3 @@ def _own_strength(view: CommonView, photo: int) -> float:
     lit = view.lit_cells(photo)
     ratio = view.in_cells(view.textures[photo] ** 2) / (view.in_cells(view.common(photo) ** 2) + 1e-12)
     return float(np.sqrt(np.median(ratio[lit]))) if lit.any() else 1.0
-
-
-def _coarse_match(stack: PhotoStack, indices: Sequence[int], photo: int) -> float:
-    """Correlation of one photo's coarse texture with what the others have in common: blur weakens, but leaves it."""
-    size = (stack.rgb.shape[2] // COARSER, stack.rgb.shape[1] // COARSER)
-    some = [k for k in np.linspace(0, len(indices) - 1, 2 * ANCHORS).astype(int) if k != photo]
-    small = [cv2.resize(stack.rgb[indices[k]], size, interpolation=cv2.INTER_AREA) for k in (photo, *some)]
-    own, *rest = (texture_of(picture) for picture in small)
-    halves = (middle_of(rest[::2]), middle_of(rest[1::2]))
-    view = CommonView([own], [mean_of_channels(small[0]) * stack.gains[indices[photo]]], halves, [0])
-    agree = halves[0] * halves[1] > 0
-    strength = np.where(agree, np.minimum(np.abs(halves[0]), np.abs(halves[1])), 0)
-    pixels = (strength > np.median(strength)) & is_lit(view.brightness[0])
-    if not pixels.any():
-        return 1.0
-    common, seen = halves[0][pixels], own[pixels]
-    return float((common * seen).sum() / np.sqrt(max((common**2).sum() * (seen**2).sum(), 1e-20)))

@@ -29,7 +29,7 @@ from capture.checks.alignment import (
 from capture.checks.ambient_light import shadow_findings
 from capture.checks.camera_motion import view_findings
 from capture.checks.framing import NOT_COMPARED, framing_findings
-from capture.checks.registration import Angles, Homography, Rotation
+from capture.checks.registration import Angles, Homography, Rotation, moved
 from capture.decode.exif import focal_in_pixels
 from capture.photos.channels import largest_channel, mean_of_channels
 from capture.photos.finding import Finding
@@ -131,7 +131,10 @@ def check_and_register(
     before = {i: (stack.rgb[i].copy(), stack.clipped[i].copy()) for i in own}
     for i, motion in own.items():
         _move_back(stack, i, motion)
-    again = check_stack(stack, dark, board if board is None or to_board is None else _as_seen(board, to_board))
+    if board is not None and to_board is not None:  # as the group's camera would have seen it
+        board = replace(board, rgb=board.rgb.copy(), clipped=board.clipped.copy())
+        _move_back(board, 0, to_board)
+    again = check_stack(stack, dark, board)
     for i, pixels in before.items():
         stack.rgb[i], stack.clipped[i] = pixels
     told = {finding.photo: finding for finding in found if _is_motion(finding)}
@@ -140,8 +143,13 @@ def check_and_register(
     dropped = {finding.photo for finding in kept if finding.drop}
     for i, path in enumerate(stack.paths):
         motion = own.get(i, np.eye(3)) @ (np.eye(3) if to_board is None else np.linalg.inv(to_board))
-        if path not in off | dropped and _shift_of(motion, stack) > NEAR_ENOUGH:
-            kept.append(_registered(stack, path, motion))
+        if path not in off | dropped and (length := _shift_of(motion, stack)) > NEAR_ENOUGH:
+            length *= stack.full_width / stack.rgb.shape[2]
+            text = (
+                f"the view lay {length:.1f} px off, as after a tap on the phone; the photo was moved back and is used"
+            )
+            limit = FARTHEST_PX * stack.full_width / REFERENCE_PX
+            kept.append(Finding(path, REGISTERED, text, length, limit, False, tuple(motion.ravel().tolist())))
     findings = _in_order(stack, kept)
     register(stack, findings)
     return findings
@@ -171,13 +179,6 @@ def _move_back(stack: PhotoStack, photo: int, motion: Homography) -> None:
     stack.clipped[photo] = _warped(tainted, motion, cv2.INTER_NEAREST) > 0
 
 
-def _as_seen(board: PhotoStack, motion: Homography) -> PhotoStack:
-    """The photo of the board as the group's camera would have seen it."""
-    moved = replace(board, rgb=board.rgb.copy(), clipped=board.clipped.copy())
-    _move_back(moved, 0, motion)
-    return moved
-
-
 def _warped(picture: np.ndarray, motion: Homography, flags: int) -> np.ndarray:
     size, flags = (picture.shape[1], picture.shape[0]), flags | cv2.WARP_INVERSE_MAP
     return cv2.warpPerspective(picture, motion, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
@@ -187,19 +188,10 @@ def _is_motion(finding: Finding) -> bool:
     return finding.kind in (MOVED, BOARD_OFF)
 
 
-def _registered(stack: PhotoStack, path: Path, motion: Homography) -> Finding:
-    to_file = stack.full_width / stack.rgb.shape[2]
-    length = to_file * _shift_of(motion, stack)
-    limit = FARTHEST_PX * stack.full_width / REFERENCE_PX
-    text = f"the view lay {length:.1f} px off, as after a tap on the phone; the photo was moved back and is used"
-    return Finding(path, REGISTERED, text, length, limit, False, tuple(float(value) for value in motion.ravel()))
-
-
 def _shift_of(motion: Homography, stack: PhotoStack) -> float:
     """The motion of the middle of the picture, px of the stack."""
-    middle = np.array([(stack.rgb.shape[2] - 1) / 2, (stack.rgb.shape[1] - 1) / 2, 1.0])
-    moved = motion @ middle
-    return float(np.hypot(*(moved[:2] / moved[2] - middle[:2])))
+    middle = np.array([[(stack.rgb.shape[2] - 1) / 2, (stack.rgb.shape[1] - 1) / 2]])
+    return float(np.hypot(*(moved(motion, middle) - middle)[0]))
 
 
 def _motions(
@@ -209,16 +201,20 @@ def _motions(
     farthest = FARTHEST_PX * stack.rgb.shape[2] / REFERENCE_PX
     limit = ROLLED * FARTHEST_PX * stack.full_width / REFERENCE_PX
     near = [finding for finding in found if _is_motion(finding) and finding.value <= limit]
-    moved = {finding.photo for finding in near if finding.drop}
-    useless = {finding.photo for finding in found if finding.drop} - moved
+    off = {finding.photo for finding in near if finding.drop}
+    useless = {finding.photo for finding in found if finding.drop} - off
     indices = [i for i, path in enumerate(stack.paths) if path not in useless]
     if not near or len(indices) < FEWEST_PHOTOS:
         return {}, None
-    home, rotation = home_view(stack, indices, board), _rotation(stack)
-    turns = {i: _own_angles(home, k, rotation) for k, i in enumerate(indices) if stack.paths[i] in moved}
+    height, width = stack.rgb.shape[1:3]
+    home, rotation = (
+        home_view(stack, indices, board),
+        Rotation(focal_in_pixels(stack.focal_35mm, width, height), width, height),
+    )
+    turns = {i: _own_angles(home, k, rotation) for k, i in enumerate(indices) if stack.paths[i] in off}
     own = {i: rotation.homography(one) for i, one in _shared(turns, rotation.focal, home).items()}
     own = {i: motion for i, motion in own.items() if _shift_of(motion, stack) <= farthest}
-    if board is None or len(near) == len(moved):
+    if board is None or len(near) == len(off):
         return own, None
     angles = board_rotation(board, home, rotation)
     return own, rotation.homography(angles) if np.isfinite(angles).all() else None
@@ -230,7 +226,7 @@ def _own_angles(home: HomeView, photo: int, rotation: Rotation) -> Angles:
     if not np.isfinite(start).all():
         return start
     return home.alignment.points.refined(
-        home.textures[photo], view.brightness[photo], view.others[photo], start, rotation
+        home.textures[photo], view.brightness[photo], view.others[photo], start, rotation.homography
     )[0]
 
 
@@ -243,8 +239,3 @@ def _shared(turns: dict[int, Angles], focal: float, home: HomeView) -> dict[int,
     near = allowed_px(home.textures[0]) / focal
     alike = {i: [other for other in known.values() if np.linalg.norm(other - one) < near] for i, one in known.items()}
     return {i: np.median(some, axis=0) for i, some in alike.items()}
-
-
-def _rotation(stack: PhotoStack) -> Rotation:
-    height, width = stack.rgb.shape[1:3]
-    return Rotation(focal_in_pixels(stack.focal_35mm, width, height), width, height)

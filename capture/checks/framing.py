@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from capture.checks.registration import BLACK, Homography
+from capture.checks.registration import BLACK, Homography, moved
 from capture.photos.channels import mean_of_channels
 from capture.photos.finding import Finding
-from capture.photos.photo import PhotoStack
+from capture.photos.photo import PhotoStack, smaller
 
 REFRAMED = "framed otherwise"  # kinds of finding: zoomed or turned, from the same place
 SEEN_FROM = "board from elsewhere"  # the place is another one, which the texture tells
@@ -72,14 +72,6 @@ class Framing:
         """By how much the photos are turned, clockwise as seen in the picture."""
         return float(np.degrees(np.arctan2(self.homography[1, 0], self.homography[0, 0])))
 
-    def shift(self, width: int, height: int) -> float:
-        """How far the middle of the picture goes, px."""
-        return float(_moves(self.homography, np.array([[(width - 1) / 2, (height - 1) / 2]]))[0])
-
-    def motion(self, width: int, height: int) -> float:
-        """How far places all over the picture go, px, root mean square."""
-        return float(np.sqrt(np.mean(_moves(self.homography, _grid(width, height)) ** 2)))
-
     def tiles(self, long_side: int) -> int:
         """How many tiles of the photos have matches.
 
@@ -95,7 +87,7 @@ class Framing:
         Few tiles may be off alike by as much as matches may differ, and no sample of them shows it.
         """
         grid, rng = _grid(width, height), np.random.default_rng(0)
-        here = _moved(self.homography, grid)
+        here = moved(self.homography, grid)
         tile = np.unique(self.to // (LONG_SIDE / TILES), axis=0, return_inverse=True)[1].ravel()
         members = [np.flatnonzero(tile == number) for number in range(tile.max() + 1)]
         apart = []
@@ -103,7 +95,7 @@ class Framing:
             some = np.concatenate([members[number] for number in rng.integers(len(members), size=len(members))])
             again = _fitted(self.seen[some], self.to[some], self.is_similarity)
             if again is not None and np.isfinite(again).all():
-                apart.append(np.mean(np.square(_moved(_of_stack(again, self.factor), grid) - here)))
+                apart.append(np.mean(np.square(moved(_of_stack(again, self.factor), grid) - here)))
         by_samples = np.sqrt(2 * np.median(apart)) if apart else 0.0
         return float(np.hypot(by_samples, NEAR_PX / self.factor / np.sqrt(len(members))))
 
@@ -137,11 +129,13 @@ def _said(framing: Framing, stack: PhotoStack, board: str) -> tuple[str, str]:
     """Return kind and sentence of a motion; empty where it is none to speak of."""
     height, width = stack.rgb.shape[1:3]
     where = f"{framing.matches} points of texture that they share with {board}, the photo of the board, lie"
-    if framing.motion(width, height) <= AT_HOME * max(width, height):
+    grid = _grid(width, height)
+    moves = np.hypot(*(moved(framing.homography, grid) - grid).T)
+    if np.sqrt(np.mean(moves**2)) <= AT_HOME * max(width, height):
         return "", ""
     if framing.is_similarity:
         scale, turn = framing.scale(), framing.turn_deg()
-        shift = framing.shift(width, height) / width
+        shift = moves[len(moves) // 2] / width  # of the middle of the picture
         is_zoomed, is_turned = abs(np.log(scale)) > ZOOMED, abs(turn) > 90
         off_turn = 180 - abs(turn) if is_turned else abs(turn)
         if off_turn < UPRIGHT_DEG and (is_turned or (is_zoomed and shift <= ASIDE)):
@@ -181,9 +175,7 @@ def _factor(stack: PhotoStack) -> float:
 def _even(stack: PhotoStack, indices: Sequence[int]) -> Grey:
     """The median of some photos with the same contrast everywhere, so that light and shadows do not count."""
     some = np.array(indices)[np.linspace(0, len(indices) - 1, min(len(indices), MEDIAN_OF)).round().astype(int)]
-    factor = _factor(stack)
-    size = (round(stack.rgb.shape[2] * factor), round(stack.rgb.shape[1] * factor))
-    small = [mean_of_channels(cv2.resize(stack.rgb[i], size, interpolation=cv2.INTER_AREA)) for i in some]
+    small = [mean_of_channels(smaller(stack.rgb[i], LONG_SIDE)) for i in some]
     log = np.median(np.log(np.maximum(small, 0) + np.float32(BLACK)), axis=0).astype(np.float32)
     detail = log - cv2.GaussianBlur(log, (0, 0), GRAIN_PX)
     strength = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), EVEN_PX))
@@ -267,11 +259,3 @@ def _of_stack(matrix: Float[np.ndarray, "3 3"], factor: float) -> Homography:
 def _grid(width: int, height: int) -> Float[np.ndarray, "n 2"]:
     u, v = np.meshgrid(np.linspace(0, width - 1, 5), np.linspace(0, height - 1, 5))
     return np.stack([u.ravel(), v.ravel()], -1)
-
-
-def _moved(matrix: Homography, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    return cv2.perspectiveTransform(points[:, None].astype(np.float64), matrix)[:, 0]
-
-
-def _moves(matrix: Homography, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    return np.hypot(*(_moved(matrix, points) - points).T)

@@ -8,9 +8,8 @@ texture's gradients (Lucas and Kanade 1981), with an error from how much the par
 How a picture moves with its camera: a shift, or the homography of a rotation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -22,6 +21,7 @@ from capture.photos.channels import mean_of_channels
 Shift = Float[np.ndarray, "2"]  # px of the stack, u and v; what the photo shows lies so far off
 Angles = Float[np.ndarray, "3"]  # of a rotation of the camera: its rotation vector, rad
 Homography = Float[np.ndarray, "3 3"]  # of pixels (u, v, 1) of the stack
+Motion = Callable[[Float[np.ndarray, " numbers"]], Homography]  # of the picture, from the others to a moved photo
 BLACK = 0.004  # added to brightness before the logarithm: about one step of 8-bit sRGB
 DIM = 0.02  # brightness below which noise and BLACK govern the contrast
 BRIGHT = 0.9  # brightness above which saturation does
@@ -38,6 +38,7 @@ FEWEST_POINTS = 500
 STRONGER_THAN = 70  # percentile of gradients that points are taken from
 ALIKE = 0.5  # of a gradient's length, by which the halves may differ in it: else light made it
 STEPS, VOTES = 30, 3  # of the refinement, at most; of its robust weights in each
+SMALL = 1e-6  # of a motion's number, px or rad, over which it is differentiated: rounding is a millionth of that
 SETTLED_PX = 0.01  # the refinement ends with a step that moves no point by more
 CUT = 4.0  # sigmas at which a point has no vote (Tukey)
 BORDER = 4  # px
@@ -47,37 +48,14 @@ Spectra = Complex[np.ndarray, "tiles rows columns"]
 Covariance = Float[np.ndarray, "numbers numbers"]  # of a shift, px^2: along the grain of wood it is far less certain
 
 
-@runtime_checkable
-class Motion(Protocol):
-    """A family of motions of the picture, each told by a few numbers; all 0: nothing moves."""
-
-    def moved(
-        self, u: Float[np.ndarray, " points"], v: Float[np.ndarray, " points"], numbers: Float[np.ndarray, " numbers"]
-    ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
-        """Where a moved photo shows what lies at (u, v) in the others, float32 px."""
-        ...
-
-    def slopes(
-        self, u: Float[np.ndarray, " points"], v: Float[np.ndarray, " points"]
-    ) -> Float[np.ndarray, "points 2 numbers"]:
-        """The derivative of that place by the numbers, at 0."""
-        ...
+def moved(motion: Homography, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """Where a photo shows what lies at these pixels in the others, px."""
+    return cv2.perspectiveTransform(np.asarray(pixels, float)[:, None], motion)[:, 0]
 
 
-class Translation:
-    """A shift by (u, v), px."""
-
-    def moved(
-        self, u: Float[np.ndarray, " points"], v: Float[np.ndarray, " points"], numbers: Shift
-    ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
-        """See Motion."""
-        return u + np.float32(numbers[0]), v + np.float32(numbers[1])
-
-    def slopes(
-        self, u: Float[np.ndarray, " points"], v: Float[np.ndarray, " points"]
-    ) -> Float[np.ndarray, "points 2 2"]:
-        """See Motion."""
-        return np.broadcast_to(np.eye(2), (len(u), 2, 2))
+def translation(shift: Shift) -> Homography:
+    """The motion that shifts the picture by (u, v), px."""
+    return np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
@@ -104,21 +82,6 @@ class Rotation:
     def from_shift(self, shift: Shift) -> Float[np.ndarray, "3"]:
         """The rotation without roll that shifts the middle of the picture so."""
         return np.array([-shift[1], shift[0], 0.0]) / self.focal
-
-    def moved(
-        self, u: Float[np.ndarray, " points"], v: Float[np.ndarray, " points"], numbers: Float[np.ndarray, "3"]
-    ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
-        """See Motion."""
-        x, y, w = self.homography(numbers) @ np.stack([u, v, np.ones_like(u)]).astype(float)
-        return (x / w).astype(np.float32), (y / w).astype(np.float32)
-
-    def slopes(
-        self, u: Float[np.ndarray, " points"], v: Float[np.ndarray, " points"]
-    ) -> Float[np.ndarray, "points 2 3"]:
-        """See Motion."""
-        x, y = (u - (self.width - 1) / 2) / self.focal, (v - (self.height - 1) / 2) / self.focal
-        rows = [[-x * y, 1 + x * x, -y], [-1 - y * y, x * y, x]]
-        return self.focal * np.moveaxis(np.array(rows, float), -1, 0)
 
 
 def texture_of(rgb: Float[np.ndarray, "height width 3"]) -> Plane:
@@ -219,27 +182,27 @@ class Points:
         brightness: Plane,
         half: int,
         start: Float[np.ndarray, " numbers"],
-        motion: Motion | None = None,
+        motion: Motion = translation,
     ) -> tuple[Float[np.ndarray, " numbers"], Covariance]:
         """A photo's motion against a half, and how certain it is; NaN where too little of the texture is lit.
 
         Args:
             start: a first guess of the motion's numbers.
-            motion: what the numbers mean; a shift unless given.
+            motion: of the picture by these numbers, 0: none.
         """
-        motion = motion or Translation()
         lit = is_lit(brightness[self.rows, self.columns])
         if lit.sum() < FEWEST_POINTS:
             return np.full(len(start), np.nan), np.full((len(start), len(start)), np.nan)
-        u, v = self.columns[lit].astype(np.float32), self.rows[lit].astype(np.float32)
+        pixels = np.stack([self.columns[lit], self.rows[lit]], -1).astype(float)
         common = self.values[half][lit].astype(float)
-        moves = motion.slopes(u, v)
+        moves = np.stack([(moved(motion(d), pixels) - pixels) / SMALL for d in SMALL * np.eye(len(start))], -1)
         along = np.einsum("pi,pij->pj", self.gradients[half][lit], moves)
         slopes = np.concatenate([along, -common[:, None]], axis=1)  # the last: fainter or stronger
         numbers, step = start.copy(), np.zeros(len(start) + 1)
         weighted = off = slopes
         for _ in range(STEPS):
-            seen = cv2.remap(texture, *motion.moved(u, v, numbers), cv2.INTER_CUBIC).ravel()
+            at = moved(motion(numbers), pixels).astype(np.float32)
+            seen = cv2.remap(texture, at[:, None], None, cv2.INTER_CUBIC).ravel()
             step[:-1] = 0
             for _ in range(VOTES):
                 off = common - seen - slopes @ step
@@ -250,15 +213,10 @@ class Points:
             numbers = numbers + step[:-1]
             if np.abs(moves @ step[:-1]).max() < SETTLED_PX:
                 break
-        return numbers, self._covariance(slopes, weighted, off, self.block[lit])
-
-    @staticmethod
-    def _covariance(slopes, weighted, off, block) -> Covariance:
-        """From the sandwich of a least-squares fit whose errors go together within a block of the picture."""
-        pull = np.zeros((BLOCKS**2, slopes.shape[1]))
-        np.add.at(pull, block, weighted * off[:, None])
+        pull = np.zeros((BLOCKS**2, slopes.shape[1]))  # for the sandwich: errors go together within a block
+        np.add.at(pull, self.block[lit], weighted * off[:, None])
         inverse = np.linalg.pinv(weighted.T @ slopes)
-        return (inverse @ (pull.T @ pull) @ inverse)[:-1, :-1]
+        return numbers, (inverse @ (pull.T @ pull) @ inverse)[:-1, :-1]
 
 
 def sigma_along(covariance: Covariance, shift: Shift) -> float:

@@ -188,9 +188,9 @@ def decode(path: Path) -> DecodedPhoto:
         "heif": read_heif,
         "avif": read_heif,
         "png": _decode_png,
-        "tiff": _decode_tiff,
+        "tiff": lambda path: read_tiff(path, *_tiff_size(path)),
         "exr": _decode_exr,
-        "clip": _decode_clip,
+        "clip": lambda path: read_frame(*(clip_of(path) or (path, 0.0))),
     }
     decoder = decoders.get(format_of(path), _decode_jpeg)
     try:
@@ -274,10 +274,6 @@ def _tiff_size(path: Path) -> tuple[int, int]:
     return int(tags[256]), int(tags[257])
 
 
-def _decode_tiff(path: Path) -> Shaped[np.ndarray, "height width 3"]:
-    return read_tiff(path, *_tiff_size(path))
-
-
 def _decode_exr(path: Path) -> Float[np.ndarray, "height width 3"]:
     """Decode R, G and B, or Y for all three. The values are linear: negative ones are noise and become 0."""
     check_size(path, *exr_size(path))
@@ -291,9 +287,3 @@ def _decode_exr(path: Path) -> Float[np.ndarray, "height width 3"]:
     if not np.isfinite(pixels).all():
         raise CaptureError(f"{path} holds values that are not finite, numbers are needed. Export it again.")
     return np.maximum(pixels, np.float32(0))
-
-
-def _decode_clip(path: Path) -> Shaped[np.ndarray, "height width 3"]:
-    found = clip_of(path)
-    assert found is not None
-    return read_frame(*found)

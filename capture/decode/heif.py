@@ -12,7 +12,7 @@ from typing import BinaryIO
 import numpy as np
 import pillow_heif
 from jaxtyping import Shaped
-from PIL import AvifImagePlugin, Image
+from PIL import AvifImagePlugin
 
 from capture.decode.limits import broken, check_size, colour_of
 from capture.decode.sandbox import Answer, decoding
@@ -87,18 +87,14 @@ def heif_picture(file: BinaryIO) -> Iterator[Answer]:
     is_avif = content[8:12] in AVIF_BRANDS
     file.seek(0)
     with AvifImagePlugin.AvifImageFile(file) if is_avif else pillow_heif.HeifImageFile(file) as image:
-        yield Answer((*image.size, container_transfer(content)), pixels=_exif_block(image))
+        exif = np.frombuffer((image.info.get("exif") or b"")[:LARGEST_EXIF], np.uint8)
+        yield Answer((*image.size, container_transfer(content)), pixels=exif)
         if is_avif:  # Pillow ignores its rotation tags
             yield Answer(pixels=np.asarray(image.convert("RGB")))
             return
     pixels = np.asarray(pillow_heif.open_heif(content, convert_hdr_to_8bit=False))
     pixels = np.repeat(pixels[..., None], 3, 2) if pixels.ndim == 2 else pixels[..., :3]
     yield Answer(pixels=undo_turns(pixels, container_turns(content)))
-
-
-def _exif_block(image: Image.Image) -> Shaped[np.ndarray, " bytes"]:
-    block = image.info.get("exif") or b""
-    return np.frombuffer(block[:LARGEST_EXIF], np.uint8)
 
 
 def container_turns(file: bytes) -> list[tuple[bytes, int]]:

@@ -80,26 +80,15 @@ def _read_exr(data: bytes, name: str) -> Float[np.ndarray, "rows columns 3"]:
     with tempfile.TemporaryDirectory(prefix="shadowgraph-") as folder:
         path = Path(folder) / "panorama.exr"  # OpenEXR reads files only; the visitor's own name never reaches the disk
         path.write_bytes(data)
-        _check_exr(_header(path, name), name)
         try:
+            _check_exr(exr_header(path), name)
             channels = read_exr(path)
         except BrokenFile as error:
-            raise _unreadable(name, error) from error
+            raise CaptureError(f"{name}: not a readable OpenEXR file ({error.reason}); copy it again.") from error
     names = ("R", "G", "B") if {"R", "G", "B"} <= set(channels) else ("Y", "Y", "Y")
     if not set(names) <= set(channels):
         raise CaptureError(f"{name}: channels {', '.join(sorted(channels))}; R, G and B (or Y) were needed.")
     return np.stack([channels[c] for c in names], -1)
-
-
-def _header(path: Path, name: str) -> ExrHeader:
-    try:
-        return exr_header(path)
-    except BrokenFile as error:
-        raise _unreadable(name, error) from error
-
-
-def _unreadable(name: str, error: BrokenFile) -> CaptureError:
-    return CaptureError(f"{name}: not a readable OpenEXR file ({error.reason}); copy it again.")
 
 
 def _check_exr(header: ExrHeader, name: str) -> None:

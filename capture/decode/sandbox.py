@@ -188,7 +188,8 @@ class _Decoder:
             self._drop_handed()
             os.close(memory)
         if "fault" in reply:
-            raise broken(self._path, _named(reply.get("text"), self._path)) if self.is_waiting else self._too_much(room)
+            said = COPY_IN_MEMORY.sub(self._path.name, str(reply.get("text")))
+            raise broken(self._path, said) if self.is_waiting else self._too_much(room)
         return answer
 
     def end(self) -> None:
@@ -245,11 +246,6 @@ class _Decoder:
             f"{self._path} could not be decoded within {room / 1e9:.1f} GB of memory, more than a picture of its size "
             "takes. Copy it again from the phone, or remove it; where memory is short, close other programs."
         )
-
-
-def _named(text: object, path: Path) -> str:
-    """Return a decoder's message, with the file's name in place of that of its copy in memory."""
-    return COPY_IN_MEMORY.sub(path.name, str(text))
 
 
 def _checked(reply: dict[str, Any], memory: int, most_bytes: int) -> Answer:

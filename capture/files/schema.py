@@ -92,25 +92,16 @@ def check_numbers(value: Any, file: str, advice: str = CORRECT, name: str = "") 
             raise CalibrationError(f"{file}: {place or 'the file'} is {one!s:.80}; needed: a finite number. {advice}")
 
 
-def read_value(path: Path, advice: str = CORRECT) -> Any:
-    """Return the content of a JSON file of a run folder, which may be a stranger's.
-
-    Raises:
-        CalibrationError: it is no regular file, is too large, or is not JSON.
-    """
-    try:
-        return parse_json(read_regular(path, LARGEST_FILE).decode("utf-8-sig"))
-    except (OSError, ValueError) as error:
-        raise CalibrationError(f"{path} cannot be read as JSON ({why(error)}). {advice}") from error
-
-
 def read_as(path: Path, kind: type[Kind], advice: str = CORRECT) -> tuple[Kind, Any]:
     """Return the JSON file of a run folder, which may be a stranger's, as a type, and as it stands.
 
     Raises:
         CalibrationError: it is no regular file, is too large, is not JSON, or a value is of another type; names it.
     """
-    value = read_value(path, advice)
+    try:
+        value = parse_json(read_regular(path, LARGEST_FILE).decode("utf-8-sig"))
+    except (OSError, ValueError) as error:
+        raise CalibrationError(f"{path} cannot be read as JSON ({why(error)}). {advice}") from error
     check_numbers(value, str(path), advice)
     return as_type(value, kind, str(path), advice), value
 

@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 from PIL import Image
 
-from capture.decode.exif import Exposure, exposure_of, focal_of, taken_of
+from capture.decode.exif import Exposure, exposure_of, focal_of
 from capture.decode.formats import decode, decode_small, read_exif, reduction, stored_channels
 from capture.decode.sandbox import stop_decoders
 from capture.errors import CaptureError
 from capture.files.atomic import atomic_file
 from capture.photos.channels import largest_channel, mean_of_channels
-from capture.photos.store import DiskStore, MemoryStore, PhotoRecord, PhotoStore
+from capture.photos.store import PhotoRecord, PhotoStore
 
 CLIPPED_SRGB = 254 / 255  # encoded value from which a sample counts as saturated: JPEG rounds 255 down to 254
 CLIPPED_RAW = 0.98  # share of the white level from which a RAW value is no longer trusted to be linear
@@ -41,7 +41,6 @@ class Photo:
     exposure: Exposure
     path: Path
     focal_35mm: float | None = None  # 35 mm equivalent focal length, mm
-    taken_s: float | None = None  # DateTimeOriginal as seconds since the epoch, no time zone
     is_linear: bool = False  # True for RAW: no tone curve had to be assumed
 
 
@@ -114,7 +113,6 @@ def read_photo(path: Path, as_linear: bool = False) -> Photo:
         exposure=exposure_of(decoded.exif),
         path=path,
         focal_35mm=focal_of(decoded.exif),
-        taken_s=taken_of(decoded.exif),
         is_linear=decoded.is_linear,
     )
 
@@ -171,8 +169,7 @@ def read_stack(
     """
     if not paths:
         raise CaptureError("no photos were given, at least one is needed. Check the capture folder.")
-    settings = {"long_side": long_side, "as_linear": as_linear}
-    store: PhotoStore = MemoryStore(len(paths)) if kept is None else DiskStore(kept, [str(p) for p in paths], settings)
+    store = PhotoStore([str(p) for p in paths], kept, {"long_side": long_side, "as_linear": as_linear})
 
     def fill(index: int) -> None:
         store.put(index, *_read_reduced(paths[index], long_side, as_linear))
@@ -221,14 +218,18 @@ def _read_reduced(
 def _reduce(
     rgb: Float[np.ndarray, "height width 3"], clipped: Bool[np.ndarray, "height width"], long_side: int
 ) -> tuple[Float[np.ndarray, "small_height small_width 3"], Bool[np.ndarray, "small_height small_width"]]:
-    height, width = clipped.shape
+    """Return both at most `long_side` px long: a saturated pixel taints every reduced one that it contributes to."""
+    if max(clipped.shape) <= long_side:
+        return rgb, clipped
+    return smaller(rgb, long_side), smaller(clipped.astype(np.float32), long_side) > 0
+
+
+def smaller(picture: Shaped[np.ndarray, "height width *channels"], long_side: int) -> Shaped[np.ndarray, "..."]:
+    """Return a picture, area-averaged so that the longer side is at most `long_side` px."""
+    height, width = picture.shape[:2]
     scale = min(1.0, long_side / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    if size == (width, height):
-        return rgb, clipped
-    # A saturated pixel taints every reduced pixel that it contributes to.
-    tainted = cv2.resize(clipped.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
-    return cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), tainted
+    return picture if scale == 1 else np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
 
 def _refuse_mixed_sizes(paths: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> None:
@@ -267,7 +268,7 @@ def read_small_photo(path: Path, long_side: int) -> Photo:
     pixels = decode_small(path, long_side)
     rgb, clipped = _reduce(*_linear(pixels, False), long_side)
     exif = read_exif(path)
-    return Photo(rgb, clipped, exposure_of(exif), path, focal_of(exif), taken_of(exif), pixels.dtype == np.float32)
+    return Photo(rgb, clipped, exposure_of(exif), path, focal_of(exif), pixels.dtype == np.float32)
 
 
 def stack_of(photos: Sequence[Photo], full_size: tuple[int, int]) -> PhotoStack:
@@ -290,10 +291,7 @@ def read_thumbnail(path: Path, long_side: int) -> UInt8[np.ndarray, "height widt
     Raises:
         CaptureError: as `read_photo`.
     """
-    pixels = decode_small(path, long_side)
-    scale = min(1.0, long_side / max(pixels.shape[:2]))
-    size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
-    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    small = smaller(decode_small(path, long_side), long_side)
     if small.dtype == np.float32:
         return encode_srgb(small)
     return small if small.dtype == np.uint8 else (small / np.uint16(257)).astype(np.uint8)

@@ -5,14 +5,14 @@ Each photo has a checksum: one that was incompletely written, as in a power cut,
 """
 
 import json
-import os
 import threading
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -34,59 +34,21 @@ class PhotoRecord:
     is_linear: bool = False  # no tone curve had to be assumed
 
 
-class PhotoStore(Protocol):
+@dataclass(frozen=True, kw_only=True)
+class _Line(PhotoRecord):
+    """One photo in LIST."""
+
+    index: int
+    sums: tuple[int, int]  # CRC of its pixels in COLOURS and CLIPPED
+
+
+class PhotoStore:
     """Reduced photos by their number; several threads may call `put`."""
 
-    taken: dict[int, PhotoRecord]
+    def __init__(self, names: list[str], folder: Path | None, settings: Mapping[str, Any]):
+        """Store photos in memory, or continue with those in a folder.
 
-    def put(
-        self,
-        index: int,
-        rgb: Float[np.ndarray, "height width 3"],
-        clipped: Bool[np.ndarray, "height width"],
-        taken: PhotoRecord,
-    ) -> None:
-        """Store a photo; if its size differs from the first one's, only `taken` is stored."""
-        ...
-
-    def arrays(self) -> tuple[Float[np.ndarray, "photos height width 3"], Bool[np.ndarray, "photos height width"]]:
-        """Return all photos as writable arrays; changes to them are not stored."""
-        ...
-
-
-class MemoryStore:
-    """Photos in memory."""
-
-    def __init__(self, count: int):
-        self.taken: dict[int, PhotoRecord] = {}
-        self._count = count
-        self._rgb, self._clipped = np.zeros((count, 0, 0, 3), np.float32), np.zeros((count, 0, 0), bool)
-
-    def put(
-        self,
-        index: int,
-        rgb: Float[np.ndarray, "height width 3"],
-        clipped: Bool[np.ndarray, "height width"],
-        taken: PhotoRecord,
-    ) -> None:
-        """See PhotoStore."""
-        if not self.taken:
-            self._rgb = np.zeros((self._count, *rgb.shape), np.float32)
-            self._clipped = np.zeros((self._count, *clipped.shape), bool)
-        if rgb.shape == self._rgb.shape[1:]:
-            self._rgb[index], self._clipped[index] = rgb, clipped
-        self.taken[index] = taken
-
-    def arrays(self) -> tuple[Float[np.ndarray, "photos height width 3"], Bool[np.ndarray, "photos height width"]]:
-        """See PhotoStore."""
-        return self._rgb, self._clipped
-
-
-class DiskStore:
-    """Photos in the files of one folder, which may hold some of them already."""
-
-    def __init__(self, folder: Path, names: list[str], settings: Mapping[str, Any]):
-        """Continue with the photos in the folder; it is emptied if they are others or were read with other settings.
+        The folder is emptied if its photos are others or were read with other settings.
 
         Raises:
             OSError: the folder cannot be made or written to.
@@ -94,9 +56,14 @@ class DiskStore:
         self._folder, self._names = folder, names
         self._head = {"format": FORMAT, "photos": names, **settings}
         self._lock, self._shape = threading.Lock(), (0, 0)
+        self._held = (np.zeros((0, 0, 0, 3), np.float32), np.zeros((0, 0, 0), bool))
         self.taken: dict[int, PhotoRecord] = {}
+        if folder is None:
+            return
         folder.mkdir(parents=True, exist_ok=True)
-        for number, line in enumerate(self._lines()):
+        path = folder / LIST
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
+        for number, line in enumerate(lines):
             self._recall(line) if number else self._begin(line)
         if not self.taken:
             for name in (COLOURS, CLIPPED, LIST):
@@ -109,7 +76,9 @@ class DiskStore:
         clipped: Bool[np.ndarray, "height width"],
         taken: PhotoRecord,
     ) -> None:
-        """See PhotoStore. The data are written, not mapped, so that a full disk raises an error that can be reported.
+        """Store a photo; if its size differs from the first one's, only `taken` is stored.
+
+        Files are written, not mapped, so that a full disk raises an error that can be reported.
 
         Raises:
             OSError: the disk is full.
@@ -117,28 +86,37 @@ class DiskStore:
         with self._lock:
             if not self.taken:
                 self._shape = clipped.shape
-                self._append({**self._head, "height": clipped.shape[0], "width": clipped.shape[1]})
-        if clipped.shape == self._shape:
+                if self._folder is None:
+                    shape = (len(self._names), *self._shape)
+                    self._held = (np.zeros((*shape, 3), np.float32), np.zeros(shape, bool))
+                else:
+                    self._append({**self._head, "height": clipped.shape[0], "width": clipped.shape[1]})
+                    for name in (COLOURS, CLIPPED):
+                        (self._folder / name).touch()
+        if clipped.shape == self._shape and self._folder is None:
+            self._held[0][index], self._held[1][index] = rgb, clipped
+        elif clipped.shape == self._shape and self._folder is not None:
             parts = (np.ascontiguousarray(rgb, np.float32), np.ascontiguousarray(clipped))
             for name, part in zip((COLOURS, CLIPPED), parts, strict=True):
-                _write_at(self._folder / name, index * part.nbytes, part)
+                with (self._folder / name).open("r+b") as file:
+                    file.seek(index * part.nbytes)
+                    file.write(part.data)
             with self._lock:
                 self._append({"index": index, "sums": [zlib.crc32(part.data) for part in parts], **asdict(taken)})
         self.taken[index] = taken
 
     def arrays(self) -> tuple[Float[np.ndarray, "photos height width 3"], Bool[np.ndarray, "photos height width"]]:
-        """See PhotoStore."""
+        """Return all photos as writable arrays; changes to them are not stored."""
+        if self._folder is None:
+            return self._held
         shape = (len(self._names), *self._shape)
         rgb = np.memmap(self._folder / COLOURS, np.float32, "c", shape=(*shape, 3))
         return rgb, np.memmap(self._folder / CLIPPED, np.bool_, "c", shape=shape)
 
     def _append(self, line: Mapping[str, Any]) -> None:
+        assert self._folder is not None
         with (self._folder / LIST).open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
-
-    def _lines(self) -> list[str]:
-        path = self._folder / LIST
-        return path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
 
     def _begin(self, line: str) -> None:
         try:
@@ -150,36 +128,15 @@ class DiskStore:
 
     def _recall(self, line: str) -> None:
         """Accept a photo as stored if the checksum of its pixels is right."""
-        if not all(self._shape):
-            return
+        assert self._folder is not None
+        count = self._shape[0] * self._shape[1]
         try:
-            entry = parse_json(line)
-            index, sums = int(entry["index"]), list(entry["sums"])
-            size, focal = (int(entry["width"]), int(entry["height"])), entry["focal_35mm"]
-            focal, is_linear = None if focal is None else float(focal), bool(entry["is_linear"])
-            taken = PhotoRecord(*size, Exposure(**entry["exposure"]), focal, is_linear)
-            sizes = (12 * self._shape[0] * self._shape[1], self._shape[0] * self._shape[1])
-            found = [
-                zlib.crc32(_read_at(self._folder / name, index * size, size))
-                for name, size in zip((COLOURS, CLIPPED), sizes, strict=True)
-            ]
-        except (ValueError, KeyError, TypeError, OSError):
+            entry = msgspec.json.decode(line, type=_Line)
+            found = tuple(
+                zlib.crc32(np.fromfile(self._folder / name, np.uint8, size, offset=entry.index * size))
+                for name, size in ((COLOURS, 12 * count), (CLIPPED, count))
+            )
+        except (msgspec.DecodeError, RecursionError, ValueError, OSError):
             return
-        if 0 <= index < len(self._names) and found == sums:
-            self.taken[index] = taken
-
-
-def _write_at(path: Path, offset: int, values: np.ndarray) -> None:
-    file = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
-    try:
-        with os.fdopen(file, "wb", closefd=False) as stream:
-            stream.seek(offset)
-            stream.write(values.data)
-    finally:
-        os.close(file)
-
-
-def _read_at(path: Path, offset: int, count: int) -> bytes:
-    with path.open("rb") as file:
-        file.seek(offset)
-        return file.read(count)
+        if count and 0 <= entry.index < len(self._names) and found == entry.sums:
+            self.taken[entry.index] = entry

@@ -80,8 +80,14 @@ def load_capture(folder: Path, seen: SeenPhotos | None = None) -> Capture:
             f"needed there. Move them into {(views or lies)[0].name}/session.toml, names as in that folder."
         )
     capture = _of_views(folder, views, settings, (), "", seen)
-    capture = replace(capture, lies=tuple(_lie(one, settings, capture.board, seen) for one in lies))
-    _refuse_many(capture)
+    anew = (_of_views(one, folders_named(one, VIEWS), settings, capture.board, one.name, seen) for one in lies)
+    capture = replace(capture, lies=tuple(anew))
+    count = len(capture.sessions())
+    if count > MOST_VIEWS:
+        raise CaptureError(
+            f"{folder} holds {count} places of the tripod, those of {LIES}* included; at most {MOST_VIEWS} are solved "
+            "together. Remove those that show least."
+        )
     return capture
 
 
@@ -105,28 +111,13 @@ def _refuse_unclear(folder: Path, views: list[Path], lies: list[Path]) -> None:
         )
 
 
-def _refuse_many(capture: Capture) -> None:
-    count = len(capture.sessions())
-    if count > MOST_VIEWS:
-        raise CaptureError(
-            f"{capture.folder} holds {count} places of the tripod, those of {LIES}* included; at most {MOST_VIEWS} are "
-            "solved together. Remove those that show least."
-        )
-
-
-def _lie(folder: Path, common: SessionSettings, board: Sequence[Path], seen: SeenPhotos) -> Capture:
-    """Return the capture of the object laid anew."""
-    views = folders_named(folder, VIEWS)
-    return replace(_of_views(folder, views, common, board, folder.name, seen), name=folder.name)
-
-
 def _of_views(
     folder: Path, views: Sequence[Path], common: SessionSettings, board: Sequence[Path], name: str, seen: SeenPhotos
 ) -> Capture:
     """Return the capture of these views' folders; without any, the folder itself is a view.
 
     Args:
-        name: of the folder, as its views are called in sentences.
+        name: of a lie, as its views are called in sentences.
 
     Raises:
         CaptureError: none of them can be read.
@@ -149,7 +140,7 @@ def _of_views(
     side = photos_in(folder / ROLE_FOLDERS["side"]) if views else []
     taken = {path for session in sessions for path in session.board}
     rest = tuple(path for path in shared if path not in taken)
-    return Capture(folder, _with_side(sessions, side), rest, (), tuple(left_out), common)
+    return Capture(folder, _with_side(sessions, side), rest, (), tuple(left_out), common, name)
 
 
 def _with_board(session: Session, shared: Sequence[Path], seen: SeenPhotos) -> Session:

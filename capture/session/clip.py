@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from capture.decode.video import Bgr, frames_of, read_clip
+from capture.decode.video import frames_of, read_clip
 from capture.errors import CaptureError
 from capture.files.names import frame_path
-from capture.photos.photo import decode_srgb
+from capture.photos.photo import decode_srgb, smaller
 from capture.session.roles import BLACK, CELL_PX, DARK, EVEN, THUMBNAIL_PX, cells_of, evenness
 
 SLOT_S = 0.2  # one candidate, the sharpest frame, per slot: a hand moves the light by some centimetres in this time
@@ -156,7 +156,8 @@ def _candidates(clip: Path) -> _Candidates:
     found: list[tuple[float, float, float, np.ndarray]] = []
     columns, last = 0, (0.0, np.zeros(0))
     for time_s, frame in frames_of(clip, slot / LOOKS_PER_SLOT):
-        grey, thumbnail = _small(frame)
+        grey = smaller(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), SHARPNESS_PX)
+        thumbnail = smaller(grey, THUMBNAIL_PX)
         columns = thumbnail.shape[1] // CELL_PX
         energy = float((cv2.Laplacian(grey, cv2.CV_32F) ** 2).mean()) / max(float(grey.mean()), 1.0) ** 2
         motion = _change(last, (time_s, thumbnail))
@@ -184,17 +185,6 @@ def _change(before: tuple[float, np.ndarray], now: tuple[float, np.ndarray]) -> 
     if before[1].shape != now[1].shape or now[0] <= before[0]:
         return 0.0
     return float(cv2.absdiff(before[1], now[1]).mean()) / max(float(now[1].mean()), 1.0) / (now[0] - before[0])
-
-
-def _small(frame: Bgr) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frame in grey, for sharpness, and its thumbnail."""
-    grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-    sizes = []
-    for long_side in (SHARPNESS_PX, THUMBNAIL_PX):
-        scale = min(1.0, long_side / max(grey.shape))
-        sizes.append((max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))))
-    fine = cv2.resize(grey, sizes[0], interpolation=cv2.INTER_AREA)
-    return fine, cv2.resize(fine, sizes[1], interpolation=cv2.INTER_AREA)
 
 
 def _lit_by_room(frames: _Candidates, room: Float[np.ndarray, "k cells"]) -> Bool[np.ndarray, " n"]:

@@ -35,15 +35,6 @@ class Solid:
     is_round: bool = True
 
 
-@dataclass(frozen=True)
-class DeclaredObjects:
-    """Solids and lights as the user declares them; defaults for entries that session.toml lacks."""
-
-    solids: tuple[Solid, ...] = ()
-    light_kind: str = "flashlight"  # "sun": from one direction, the same for the whole scene
-    lights_at_once: int = 1
-
-
 class PhoneBack(Struct, frozen=True, forbid_unknown_fields=True):
     """Known facts about the photo of the flashlight phone's back; the program finds those that are None."""
 
@@ -60,14 +51,12 @@ class Height:
     sigma: float
 
 
-def parse_height(value: Any, path: Path) -> Height | None:
+def parse_height(value: Any, path: Path) -> Height:
     """Parse the entry `height` of session.toml: millimetres (120), or with one sigma ("120 +- 2").
 
     Raises:
         CaptureError: the value is neither, or not positive.
     """
-    if value is None:
-        return None
     parts = value.replace("±", "+-").split("+-") if isinstance(value, str) else [value]
     try:
         numbers = [float(part) for part in parts] if not isinstance(value, bool) else []

@@ -56,18 +56,15 @@ def _groups(photos: Sequence[PhotoFeatures]) -> list[list[PhotoFeatures]]:
     """Return the photos by place, larger groups first."""
     rest, groups = list(photos), []
     while rest:
-        alike = [[other for other in rest if _shares_view(photo, other)] for photo in rest]
+        alike = [
+            [b for b in rest if b is a or (b.header.camera == a.header.camera and agreement(a, b) >= SAME_VIEW)]
+            for a in rest
+        ]
         group = max(alike, key=len)
         same = next((known for known in groups if _was_pushed(known[0], group[0])), None)
         groups.append(group) if same is None else same.extend(group)
         rest = [photo for photo in rest if all(photo is not one for one in group)]
     return groups
-
-
-def _shares_view(one: PhotoFeatures, other: PhotoFeatures) -> bool:
-    if one is other:
-        return True
-    return one.header.camera == other.header.camera and agreement(one, other) >= SAME_VIEW
 
 
 def _was_pushed(one: PhotoFeatures, other: PhotoFeatures) -> bool:

@@ -4,12 +4,12 @@ import re
 import sys
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, structs
 
 from capture.decode.formats import is_photo_name
 from capture.errors import CaptureError, Remedy
@@ -21,10 +21,10 @@ from capture.session.clip import choose_any_frames, choose_board_frames, choose_
 from capture.session.declared_objects import (
     MOST_LIGHTS,
     Cube,
-    DeclaredObjects,
     Height,
     Peg,
     PhoneBack,
+    Solid,
     Thickness,
     parse_height,
 )
@@ -55,47 +55,38 @@ MOST_CLIP_FRAMES = 300
 MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 
 
-@dataclass(frozen=True)
-class SessionSettings:
+class SessionSettings(Struct, frozen=True, forbid_unknown_fields=True):
     """The settings in session.toml; None where it does not state them."""
 
-    board: str | None = None  # such as "charuco:5x7:30:22:DICT_4X4_50" "checkerboard:9x6:24.25" or "paper:A4"
-    led_offset_mm: tuple[float, float, float] | None = None  # lens to LED in the flashlight phone's camera frame
-    roles: tuple[tuple[str, tuple[str, ...]], ...] = ()  # (role, file names) that overrule the roles found
-    clip_frames: int = CLIP_FRAMES  # number of frames of a clip that become photos
-    declared: DeclaredObjects = field(default_factory=DeclaredObjects)  # solids with shadows, and the kind of light
-    phone_back: PhoneBack = field(default_factory=PhoneBack)  # known facts about the photo of that name
-    ball: tuple[float, float, float] | None = None  # x, y, radius (px) of a shiny ball whose highlights show the light
-    scale: float | None = None  # mm: the object's height, or without ground its largest extent in the picture
-    height: Height | None = None  # of the object's highest point above the table
-    board_thickness_mm: float | None = None  # from the table to the printed side: paper, and what it is glued to
-
-
-class _SessionFile(Struct, forbid_unknown_fields=True):
-    """session.toml."""
-
     board: Annotated[Text, Meta(description='a text such as "checkerboard:9x6:24.25"')] | None = None
+    # lens to LED in the flashlight phone's camera frame
     led_offset_mm: Annotated[Vector, Meta(description="three numbers in millimetres")] | None = None
-    roles: Annotated[
-        dict[Literal["board", "lit", "light", "dark", "side"], list[str]],
+    roles: Annotated[  # of files, which overrule the roles found
+        dict[Literal["board", "lit", "light", "dark", "side"], tuple[str, ...]],
         Meta(description="lists of file names under board, lit, light, dark or side"),
     ] = msgspec.field(default_factory=dict)
+    # number of frames of a clip that become photos
     clip_frames: Annotated[int, Meta(ge=FEWEST_LIT, le=MOST_CLIP_FRAMES)] = CLIP_FRAMES
     pegs: tuple[Peg, ...] = ()
     cubes: tuple[Cube, ...] = ()
-    light: Literal["flashlight", "sun"] = "flashlight"
+    light: Literal["flashlight", "sun"] = "flashlight"  # "sun": from one direction, the same for the whole scene
     lights_at_once: Annotated[int, Meta(ge=1, le=MOST_LIGHTS)] = 1
-    phone_back: PhoneBack = PhoneBack()
-    ball: (
+    phone_back: PhoneBack = PhoneBack()  # known facts about the photo of that name
+    ball: (  # shiny, whose highlights show the light
         Annotated[
             tuple[Number, Number, Positive],
             Meta(description="[x, y, radius] of the ball in pixels of the photos as stored"),
         ]
         | None
     ) = None
-    scale: Any = None  # a text, see parse_length
-    height: Any = None  # a number or a text, see parse_height
-    board_thickness_mm: Thickness | None = None
+    scale: float | None = None  # mm: the object's height, or without ground its largest extent in the picture
+    height: Height | None = None  # of the object's highest point above the table
+    board_thickness_mm: Thickness | None = None  # from the table to the printed side: paper, and what it is glued to
+
+    @property
+    def solids(self) -> tuple[Solid, ...]:
+        """The declared pegs and cubes, whose shadows show the light."""
+        return tuple(one.solid() for one in (*self.pegs, *self.cubes))
 
 
 @dataclass(frozen=True)
@@ -133,15 +124,15 @@ def load_session(folder: Path, common: SessionSettings | None = None, seen: Seen
     refuse_no_folder(folder, "the folder that holds the photos")
     settings = load_settings(folder)
     if common is not None:
-        settings = settings if (folder / SETTINGS_FILE).exists() else replace(common, roles=())
-        settings = replace(settings, board=settings.board or common.board)
-        if settings.board_thickness_mm is None:
-            settings = replace(settings, board_thickness_mm=common.board_thickness_mm)
+        settings = settings if (folder / SETTINGS_FILE).exists() else structs.replace(common, roles={})
+        thickness = settings.board_thickness_mm
+        thickness = common.board_thickness_mm if thickness is None else thickness
+        settings = structs.replace(settings, board=settings.board or common.board, board_thickness_mm=thickness)
     seen = SeenPhotos() if seen is None else seen
     with naming_skipped(folder, ROLE_FOLDERS.values()) as skipped:
         roles, left_out, notes = _roles(folder, settings, seen, needs_board=common is None)
     notes += skipped
-    if is_sorted(folder) and not any(role == "board" for role, _ in settings.roles):
+    if is_sorted(folder) and "board" not in settings.roles:
         roles = replace(roles, board=tripod_first(roles.board, roles.lit, seen))
     mask = folder / MASK
     given = mask if mask.is_file() else None
@@ -161,20 +152,12 @@ def load_settings(folder: Path) -> SessionSettings:
     path = folder / SETTINGS_FILE
     if not path.exists():
         return SessionSettings()
-    found = as_type(read_entries(path), _SessionFile, str(path), "", CaptureError)
-    solids = tuple(one.solid() for one in (*found.pegs, *found.cubes))
-    return SessionSettings(
-        board=found.board,
-        led_offset_mm=found.led_offset_mm,
-        roles=tuple((role, tuple(names)) for role, names in found.roles.items()),
-        clip_frames=found.clip_frames,
-        declared=DeclaredObjects(solids, found.light, found.lights_at_once),
-        phone_back=found.phone_back,
-        ball=found.ball,
-        scale=None if found.scale is None else parse_length(found.scale, f"{path}: scale"),
-        height=parse_height(found.height, path),
-        board_thickness_mm=found.board_thickness_mm,
-    )
+    entries = read_entries(path)
+    if "scale" in entries:
+        entries["scale"] = parse_length(entries["scale"], f"{path}: scale")
+    if "height" in entries:
+        entries["height"] = asdict(parse_height(entries["height"], path))
+    return as_type(entries, SessionSettings, str(path), "", CaptureError)
 
 
 def read_entries(path: Path) -> dict[str, Any]:
@@ -245,7 +228,7 @@ def named_photos(folder: Path, settings: SessionSettings) -> dict[str, list[Path
     Raises:
         CaptureError: one of them is not in the capture.
     """
-    return {role: [_named(folder, name) for name in names] for role, names in settings.roles}
+    return {role: [_named(folder, name) for name in names] for role, names in settings.roles.items()}
 
 
 def _roles(
@@ -266,7 +249,8 @@ def _roles(
         notes = tuple(f"{clip.name} was left out: the photos beside it are a capture" for clip in clips)
     except CaptureError as error:
         if not clips:
-            raise _with_faults(error, sound.left_out) from None
+            said = f"{error} Left out: {grouped(sound.left_out)}."
+            raise (type(error)(said) if sound.left_out else error) from None
         left_out, loose, stills = (
             sound.left_out,
             tuple(sound.by_role[""]),
@@ -310,8 +294,7 @@ def _with_frames(roles: Roles, filmed: Mapping[str, Sequence[Path]], settings: S
     """Return the roles with frames of a clip, but for frames that session.toml names: they have their role."""
     known = {path for role in ROLE_FOLDERS for path in getattr(roles, role)}
     fresh = {role: tuple(path for path in paths if path not in known) for role, paths in filmed.items()}
-    is_named = any(role == "board" for role, _ in settings.roles)
-    board = (*roles.board, *fresh["board"]) if is_named else (*fresh["board"], *roles.board)
+    board = (*roles.board, *fresh["board"]) if "board" in settings.roles else (*fresh["board"], *roles.board)
     return replace(roles, board=board, lit=(*roles.lit, *fresh["lit"]), dark=(*roles.dark, *fresh["dark"]))
 
 
@@ -321,11 +304,6 @@ def _named(folder: Path, name: str) -> Path:
     if not inside or not stored_file(path).is_file():
         raise CaptureError(f"{folder / SETTINGS_FILE} names {name}, which is not in {folder}. Correct the name.")
     return path
-
-
-def _with_faults(error: CaptureError, left_out: Sequence[Finding]) -> CaptureError:
-    """Return the error with what is wrong with the photos that were left out, all at once."""
-    return type(error)(f"{error} Left out: {grouped(left_out)}.") if left_out else error
 
 
 def _refuse_few_loose(sound: SoundPhotos, folder: Path) -> None:

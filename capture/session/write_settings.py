@@ -62,7 +62,7 @@ def set_role(capture: Path, photo: str, role: str) -> None:
         target.parent.mkdir(exist_ok=True)
         path.rename(target)
         return
-    roles = {name: list(names) for name, names in load_settings(capture).roles}
+    roles = {name: list(names) for name, names in load_settings(capture).roles.items()}
     for names in roles.values():
         if photo in names:
             names.remove(photo)

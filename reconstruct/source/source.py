@@ -256,7 +256,7 @@ def _may_lack_a_board(capture: Capture, options: RunOptions) -> bool:
     session = capture.views[0]
     if len(capture.sessions()) > 1 or not session.board:
         return False
-    is_named = options.board or session.settings.board or any(role == "board" for role, _ in session.settings.roles)
+    is_named = options.board or session.settings.board or "board" in session.settings.roles
     if is_named or options.lights in WAYS[1:] or session.board[0].parent != session.folder or clip_of(session.board[0]):
         return False
     return guess_board([grey_of(read_photo(path)) for path in session.board]) is None
