@@ -1,6 +1,5 @@
 """Small 8-bit sRGB pictures: of photos, of depth and normals, and of a mesh, drawn without a graphics card."""
 
-import base64
 import io
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
 from capture.photos.photo import decode_srgb, encode_srgb
+from viewer.stage.pack import as_address, jpeg
 
 if TYPE_CHECKING:  # beside a run a page shows photos only, and opens sooner without it
     import trimesh
@@ -32,12 +32,11 @@ STRONG_DIFFERENCE = 0.2  # of full sRGB scale: shown as full colour
 
 def data_uri(picture: Picture) -> str:
     """Return the picture as a data: address for an <img>: JPEG, or PNG if it has no background."""
+    if picture.shape[-1] == 3:
+        return as_address(jpeg(picture, JPEG_QUALITY), "image/jpeg")
     out = io.BytesIO()
-    if picture.shape[-1] == 4:
-        Image.fromarray(picture).save(out, "PNG")
-        return f"data:image/png;base64,{base64.b64encode(out.getvalue()).decode()}"
-    Image.fromarray(picture).save(out, "JPEG", quality=JPEG_QUALITY)
-    return f"data:image/jpeg;base64,{base64.b64encode(out.getvalue()).decode()}"
+    Image.fromarray(picture).save(out, "PNG")
+    return as_address(out.getvalue(), "image/png")
 
 
 def reduced(picture: Picture, width: int) -> Picture:

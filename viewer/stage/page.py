@@ -102,8 +102,8 @@ def page_policy(is_served: bool) -> str:
     style = _asset("stage.css").replace("{{background}}", BACKGROUND)
     own, connects = ("'self' ", "'self'") if is_served else ("", "'none'")
     return (
-        f"default-src 'none'; script-src {_hash(script_text())}; style-src {_hash(style)}; img-src {own}data: blob:; "
-        f"connect-src {connects}; base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; script-src {hash_of(script_text())}; style-src {hash_of(style)}; "
+        f"img-src {own}data: blob:; connect-src {connects}; base-uri 'none'; form-action 'none'"
     )
 
 
@@ -152,7 +152,8 @@ def _json(value: Any) -> str:
     return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
-def _hash(text: str) -> str:
+def hash_of(text: str) -> str:
+    """Return the source of a script or style by its hash, for a content security policy."""
     digest = hashlib.sha256(text.encode()).digest()
     return f"'sha256-{base64.b64encode(digest).decode()}'"
 

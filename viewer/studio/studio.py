@@ -242,7 +242,7 @@ class Studio:
             path = self._find(key)
             if any(job.is_open and path in (job.run, Path(job.task.capture)) for job in self.queue.jobs):
                 raise CaptureError(f"{title_of(path)} runs or waits in the queue; stop that first.")
-            if key in self.folder.runs() and self.library.run_row(key, path, None)["progress"]["is_running"]:
+            if key in self.folder.runs() and self.library.run_row(key, path, None)["state"] == RUNNING:
                 raise CaptureError(f"{title_of(path)} is running in another window or terminal; stop it there first.")
             self.checks.forget(path)
             for part in self.parts.under_way(key):
