@@ -17,16 +17,8 @@ from reconstruct.run_folder.lock import is_abandoned
 from reconstruct.run_folder.requests import PAUSED, make_request, open_requests
 from reconstruct.sdf.grid import SdfGrid
 from viewer.display.run_follower import RunFollower
-from viewer.page.guard import GuardedServer
 from viewer.page.page import Page
 from viewer.report.pictures import computed_picture, is_shadow_picture
-
-
-@pytest.fixture(scope="module")
-def server():
-    guarded = GuardedServer("127.0.0.1", 0)
-    yield guarded
-    guarded.stop()
 
 
 @pytest.fixture

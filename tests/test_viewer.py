@@ -19,18 +19,9 @@ from viewer.display.layers import (
 )
 from viewer.display.run_follower import RunFollower, loss_curves, size_text, status
 from viewer.page.controls import continued
-from viewer.page.guard import GuardedServer
 from viewer.page.page import MIN_INTERVAL_S, Page, RateLimit
 
 ROOT = Path(__file__).parent.parent
-ANY_PORT = 0
-
-
-@pytest.fixture(scope="module")
-def server():
-    guarded = GuardedServer("127.0.0.1", ANY_PORT)
-    yield guarded
-    guarded.stop()
 
 
 def test_the_status_says_stage_count_and_time_left():

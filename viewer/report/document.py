@@ -3,8 +3,8 @@
 import html
 from collections.abc import Sequence
 
+from viewer.display.embedded import hash_of
 from viewer.report.drawing import Picture, data_uri
-from viewer.stage.page import hash_of
 
 STYLE = """
 :root{--bg:#fbfaf8;--card:#fff;--text:#1d2026;--muted:#667080;--line:#dfe1e6;--accent:#d9820f;--good:#1f8a53;--bad:#c8402f}

@@ -1,7 +1,6 @@
 """The stage as a page: in one file with all its parts, or as a page that asks for its parts beside it."""
 
 import base64
-import hashlib
 import html
 import json
 import re
@@ -18,7 +17,8 @@ from reconstruct.export.formats import FORMATS
 from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
 from reconstruct.stored_run.stage_pack import StagePack, addressed
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.stage.pack import as_address, unpacked_corners
+from viewer.display.embedded import as_address, hash_of
+from viewer.stage.pack import unpacked_corners
 from viewer.stage.pack_file import kind_of, stage_pack
 
 SCRIPTS = (
@@ -150,12 +150,6 @@ def _shader(name: str) -> str:
 def _json(value: Any) -> str:
     """Return JSON that ends no script element."""
     return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-
-
-def hash_of(text: str) -> str:
-    """Return the source of a script or style by its hash, for a content security policy."""
-    digest = hashlib.sha256(text.encode()).digest()
-    return f"'sha256-{base64.b64encode(digest).decode()}'"
 
 
 def _asset(name: str) -> str:

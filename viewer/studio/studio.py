@@ -57,7 +57,7 @@ class Studio:
         self.looks = Helper(folder.kept / "looks.txt")
         self.thumbnails = Helper(folder.kept / "thumbnails.txt")
         self.pictures = Helper(folder.kept / "pictures.txt")
-        self.checks = Checks(folder.kept / "checks", self.looks)
+        self.checks = Checks(folder.kept / "checks", self.looks, program)
         self.library = Library(folder, self.queue, self.parts, self.checks)
         self.trash = Trash(folder.root)
         self.pages = LivePages(folder)
