@@ -101,9 +101,9 @@ def canvas_pixels(tab) -> np.ndarray:
     return before
 
 
-def open_page(browser, url, is_drawn: bool = True):
+def open_page(browser, url, is_drawn: bool = True, size: dict[str, int] = VIEWPORT):
     """The page, and what it complained about or asked of others; its panels alone cost half as much."""
-    tab = browser.new_page(viewport=VIEWPORT)
+    tab = browser.new_page(viewport=size)
     if not is_drawn:
         tab.add_init_script(NO_DRAWING)
     tab.set_default_timeout(PATIENCE_MS)

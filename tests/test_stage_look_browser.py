@@ -121,6 +121,7 @@ def boxes(tab, *names: str) -> list[dict]:
 def test_the_object_fills_the_part_of_the_window_that_is_free(run, window, size):
     tab, (width, height) = window, size.values()
     tab.set_viewport_size(size)
+    tab.evaluate("new Promise(done => requestAnimationFrame(() => setTimeout(done)))")  # it has heard of it
     tab.evaluate("document.getElementById('panel').hidden || document.getElementById('menu').click()")
     tab.locator("#picture").dispatch_event("dblclick")  # back to the first view
     for turn in (None, "menu", 2.2, "menu"):

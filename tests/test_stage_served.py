@@ -85,7 +85,7 @@ def test_a_run_that_is_not_finished_says_so(tmp_path):
 
 @pytest.mark.browser
 def test_a_note_made_with_the_keyboard_alone_is_kept_with_the_run(browser, address, run):
-    tab, said = open_page(browser, f"http://{address}/stage/", is_drawn=False)
+    tab, said = open_page(browser, f"http://{address}/stage/", is_drawn=False, size={"width": 390, "height": 844})
     wait_until(tab, lambda: tab.evaluate("window.shadowgraph ? shadowgraph.state().samples : 0") > 0)
     tab.focus("#menu")
     tab.keyboard.press("Enter")

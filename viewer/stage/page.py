@@ -37,7 +37,6 @@ SCRIPTS = (
     "panel",
     "main",
 )
-BACKGROUND = "24, 26, 31"  # sRGB, as of the pictures
 SHADERS = ("surface.vert", "surface.frag", "depth.frag", "full.vert", "light.frag", "blur.frag", "show.frag")
 SHADERS += ("lines.vert", "lines.frag")
 READ_ERRORS = (OSError, ValueError, LookupError, TypeError, EOFError)
@@ -75,18 +74,19 @@ def page_html(
     is_served = saves == "socket"
     addresses = {part: part if is_served else as_address(pack.read(part), kind_of(part)) for part in pack.names}
     facts = addressed(pack.facts, addresses)
-    script, style = script_text(), _asset("stage.css").replace("{{background}}", BACKGROUND)
     values = {
         "title": html.escape(name),
         "size": html.escape(str(facts["size"])),
         "policy": page_policy(is_served),
-        "style": style,
+        "style": _asset("stage.css"),
         "first": html.escape(facts["addresses"]["first"]),
         "scene": _json({**facts, "name": name}),
         "document": _json(document or EMPTY),
         "served": _json({"saves": saves, "home": home, **({"formats": _file_kinds()} if is_served else {})}),
-        "shaders": "\n".join(f'<script type="text/plain" id="{name}">{_shader(name)}</script>' for name in SHADERS),
-        "script": script,
+        "shaders": "\n".join(
+            f'<script type="text/plain" id="{shader}">{_asset(f"{shader}.glsl")}</script>' for shader in SHADERS
+        ).replace("//#photo", _asset("photo.glsl")),
+        "script": script_text(),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda found: values[found.group(1)], _asset("stage.html"))
 
@@ -99,10 +99,9 @@ def _file_kinds() -> dict[str, tuple[str, str]]:
 
 def page_policy(is_served: bool) -> str:
     """Return the page's content security policy: its own script and style, and nothing from elsewhere."""
-    style = _asset("stage.css").replace("{{background}}", BACKGROUND)
     own, connects = ("'self' ", "'self'") if is_served else ("", "'none'")
     return (
-        f"default-src 'none'; script-src {hash_of(script_text())}; style-src {hash_of(style)}; "
+        f"default-src 'none'; script-src {hash_of(script_text())}; style-src {hash_of(_asset('stage.css'))}; "
         f"img-src {own}data: blob:; connect-src {connects}; base-uri 'none'; form-action 'none'"
     )
 
@@ -141,10 +140,6 @@ def read_page(run: StoredRun, path: Path) -> Contents:
     x, y, z = (float(e) for e in np.ptp(np.asarray(facts["bounds"]), axis=0))
     note = f"{len(facts['lights'])} lights, {UNIT_WORDS[run.unit]}; open it in any browser"
     return Contents(len(corners) // 3, (x, y, z), note=note)
-
-
-def _shader(name: str) -> str:
-    return _asset(f"{name}.glsl").replace("//#photo", _asset("photo.glsl"))
 
 
 def _json(value: Any) -> str:
