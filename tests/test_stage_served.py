@@ -64,7 +64,7 @@ def test_the_result_is_saved_as_other_kinds_of_files_and_as_no_unknown_one(addre
     for kind, begins in (("ply", b"ply"), ("normal-png", b"PK")):
         assert f'"{kind}":[' in page
         content = eventually(address, f"/stage/save/{kind}")
-        assert len(content) > 10_000 and content.startswith(begins)
+        assert len(content) > 1000 and content.startswith(begins)
     for kind in ("exe", "../report.json", ""):
         assert asked(address, f"/stage/save/{kind}")[0] == 404
 
