@@ -67,6 +67,23 @@ def canvas_picture(tab) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(tab.locator("canvas").first.screenshot())).convert("RGB")).astype(int)
 
 
+STATE = "window.shadowgraph ? window.shadowgraph.state() : null"  # of a stage
+
+
+def wait_samples(tab, count: int) -> None:
+    """Until each pixel of a stage has so many samples."""
+    wait_until(tab, lambda: (tab.evaluate(STATE) or {"samples": -1})["samples"] >= count)
+
+
+def stage_picture(tab, samples: int = 1, **change: dict) -> np.ndarray:
+    """sRGB of a stage as bytes, once a change of its view, lamp or what is shown is drawn with so many samples."""
+    wait_samples(tab, 1)
+    if change:
+        tab.evaluate("change => shadowgraph.set(change)", change)
+        wait_samples(tab, samples)
+    return canvas_picture(tab).astype(np.uint8)
+
+
 def brown(rgb: np.ndarray) -> int:
     """Pixels of the fake run's mesh: the ground is grey, the room dark."""
     return int(((rgb[..., 0] - rgb[..., 2] > 25) & (rgb[..., 0] > 60) & (rgb[..., 0] - rgb[..., 1] < 70)).sum())
@@ -84,9 +101,9 @@ def canvas_pixels(tab) -> np.ndarray:
     return before
 
 
-def open_page(browser, url, is_drawn: bool = True):
+def open_page(browser, url, is_drawn: bool = True, size: dict[str, int] = VIEWPORT):
     """The page, and what it complained about or asked of others; its panels alone cost half as much."""
-    tab = browser.new_page(viewport=VIEWPORT)
+    tab = browser.new_page(viewport=size)
     if not is_drawn:
         tab.add_init_script(NO_DRAWING)
     tab.set_default_timeout(PATIENCE_MS)

@@ -173,16 +173,6 @@ def browser():
         chromium.close()
 
 
-@pytest.fixture
-def program(tmp_path) -> tuple[str, str]:
-    """What stands for `shadowgraph` in a studio: each run takes 0.3 s."""
-    from test_queue import PROGRAM
-
-    file = tmp_path / "program.py"
-    file.write_text(PROGRAM.replace("seconds = sys.argv[7]", 'seconds = "0.3"'))
-    return sys.executable, str(file)
-
-
 @pytest.fixture(scope="module")
 def server():
     """A bare viser server, for panels without their page."""

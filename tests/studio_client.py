@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import quote
 
+from test_queue import PROGRAM
 from waiting import PATIENCE_S, wait_until
 
 from viewer.studio.folder import StudioFolder
@@ -72,10 +73,15 @@ class Client:
 
 
 @contextmanager
-def served(folder: Path, program: tuple[str, ...] | None = None, port: int = 0):
-    """Yield (studio, phones, the owner's client)."""
+def served(folder: Path, program: tuple[str, ...] = (), port: int = 0, run_s: str = "0.3"):
+    """Yield (studio, phones, the owner's client).
+
+    Args:
+        program: stands for `shadowgraph`; unless given, its runs take `run_s` seconds and its checks say nothing.
+    """
     kept = StudioFolder(folder)
-    studio = Studio(kept, program) if program else Studio(kept)
+    (kept.kept / "program.py").write_text(PROGRAM.replace("sys.argv[7]", repr(run_s)))
+    studio = Studio(kept, program or (sys.executable, str(kept.kept / "program.py")))
     phones = Phones(kept.kept / "phones.json", kept.kept / "phones", PhoneRoutes(studio).app)
     token, listener = kept.token(), free_socket("127.0.0.1", port)
     port = listener.getsockname()[1]

@@ -8,9 +8,10 @@ import os
 from pathlib import Path
 
 import pytest
-from chromium import PATIENCE_MS, wait_until
+from chromium import wait_until
 from studio_client import served
 from test_studio import capture_in, run_in
+from test_studio_browser import DESKTOP, PHONE, opened
 
 ROOT = Path(__file__).parent.parent
 AXE = Path(os.environ.get("AXE_CORE") or ROOT / "node_modules" / "axe-core" / "axe.min.js")
@@ -26,7 +27,6 @@ RUN = """async () => {
 }"""
 PAGES = {"": ".card", "#/capture/vase": "text=Let phones in", "#/run/runs%2Fvase": "text=Its photos"}
 PAGES |= {"#/run/runs%2Fheap": "section.save", "#/compare/runs%2Fheap|runs%2Fheap": "iframe.result"}
-SIZES = [{"width": 1600, "height": 1000}, {"width": 390, "height": 844}]
 
 
 @pytest.fixture(scope="module")
@@ -41,16 +41,13 @@ def judged(frame) -> list[str]:
     return frame.evaluate(RUN)
 
 
-@pytest.mark.parametrize(("size", "scheme"), list(zip(SIZES, ("dark", "light"), strict=True)), ids=["desktop", "phone"])
+@pytest.mark.parametrize(("size", "scheme"), [(DESKTOP, "dark"), (PHONE, "light")], ids=["desktop", "phone"])
 def test_axe_finds_nothing_serious_on_any_page(browser, folder, size, scheme):
     said: dict[str, list[str]] = {}
     with served(folder) as (_, phones, owner):
         address = f"http://127.0.0.1:{owner.port}"
-        context = browser.new_context(viewport=size, color_scheme=scheme)
-        name, _, value = owner.cookie.partition("=")
-        context.add_cookies([{"name": name, "value": value, "url": address}])
-        tab = context.new_page()
-        tab.set_default_timeout(PATIENCE_MS)
+        tab, _ = opened(browser, owner, size)
+        tab.emulate_media(color_scheme=scheme)
         for page, ready in PAGES.items():
             tab.goto(f"{address}/{page}")
             tab.wait_for_selector(ready)
@@ -73,15 +70,13 @@ def test_axe_finds_nothing_serious_on_any_page(browser, folder, size, scheme):
         tab.evaluate("for (const one of document.querySelectorAll('details')) one.open = true")
         said["stage"] = judged(tab)
         phones.turn_on("vase")
-        said |= _phones(context, phones.row())
+        said |= _phones(tab, phones.row())
         phones.turn_off()
-        context.close()
     assert not {page: bad for page, bad in said.items() if bad}
 
 
-def _phones(context, row: dict) -> dict[str, list[str]]:
-    tab, said = context.new_page(), {}
-    tab.set_default_timeout(PATIENCE_MS)
+def _phones(tab, row: dict) -> dict[str, list[str]]:
+    said = {}
     tab.goto(row["address"])
     tab.wait_for_selector("text=Choose photos")
     said["phone"] = judged(tab)

@@ -16,10 +16,11 @@ from capture.errors import CaptureError
 from reconstruct.run.batch import Task
 from reconstruct.run.queue import FAILED, FINISHED, RUNNING, STOPPED, WAITING, Queue
 
-# In the place of `shadowgraph`: `run CAPTURE --out RUN --viewer off [SECONDS]`, which writes a log as a run does.
+# In the place of `shadowgraph`: `run CAPTURE --out RUN --viewer off [SECONDS]`, which writes a log, or `check`.
 PROGRAM = """
 import json, os, pathlib, signal, sys, time
 def stop(*_): sys.exit(143)
+if sys.argv[1] == "check": sys.exit()
 signal.signal(signal.SIGTERM, stop)
 run = pathlib.Path(sys.argv[4]); run.mkdir(parents=True, exist_ok=True)
 seconds = sys.argv[7]

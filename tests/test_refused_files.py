@@ -50,38 +50,42 @@ def test_a_refused_file_is_said_without_the_servers_path_or_a_folder_that_the_se
                 assert str(tmp_path) not in one["why"] and "from the folder" not in one["why"], one["why"]
 
 
-@pytest.mark.parametrize(
-    "said",
-    ["none of the photos in {} shows a board.", "{}/IMG_1.jpg cannot be read.", "{}/photos: 1 photo. Take more."],
-)
-def test_a_run_that_failed_says_why_without_the_servers_path(tmp_path, said):
-    (tmp_path / "program.py").write_text(
-        f"import sys; print('shadowgraph: ' + {said!r}.format(sys.argv[2])); sys.exit(2)"
+def test_a_run_that_failed_says_why_without_the_servers_path(tmp_path):
+    said = ["none of the photos in {} shows a board.", "{}/IMG_1.jpg cannot be read.", "{}/photos: 1 photo. Take more."]
+    program = tmp_path / "program.py"
+    program.write_text(
+        f"import sys; at = sys.argv[2]; print('shadowgraph: ' + {said!r}[int(at[-1])].format(at)); sys.exit(2)"
     )
-    capture_in(tmp_path / "studio", "vase")
-    with served(tmp_path / "studio", (sys.executable, str(tmp_path / "program.py"))) as (_, _, owner):
-        owner.ok("start", key="vase", preset="draft")
+    with served(tmp_path / "studio", (sys.executable, str(program))) as (_, _, owner):
+        for number in range(len(said)):
+            capture_in(tmp_path / "studio", f"vase{number}")
+            owner.ok("start", key=f"vase{number}", preset="draft")
 
-        def runs():
-            return owner.get("/api/state")[1]["cards"][0]["runs"]
+        def runs() -> dict:
+            return {run["key"]: run for card in owner.get("/api/state")[1]["cards"] for run in card["runs"]}
 
-        wait_until(lambda: [run["state"] for run in runs()] == ["failed"])
-        (run,) = runs()
-    assert str(tmp_path) not in run["sentence"] and said.split("}")[1].strip("/") in run["sentence"]
+        wait_until(lambda: [run["state"] for run in runs().values()] == ["failed"] * len(said))
+        found = runs()
+    for number, words in enumerate(said):
+        sentence = found[f"runs/vase{number}-draft"]["sentence"]
+        assert str(tmp_path) not in sentence and words.split("}")[1].strip("/") in sentence
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize("count", [1, 4, 6])
-def test_photos_that_will_not_be_used_are_named_and_counted(browser, tmp_path, count):
+def test_photos_that_will_not_be_used_are_named_and_counted(browser, tmp_path):
     capture = capture_in(tmp_path, "vase")
-    for number in range(10, 10 + count):
+    for number in range(10, 16):
         (capture / "photos" / f"IMG_{number}.jpg").write_bytes(jpeg(number)[:-200])
     with served(tmp_path) as (_, _, owner):
         tab, _ = opened(browser, owner, PHONE)
         tab.goto(f"http://127.0.0.1:{owner.port}/#/capture/vase")
-        tab.wait_for_selector(f"button:has-text('Leave {'it' if count == 1 else count} out and go on')")
-        said = tab.inner_text("p:has-text('Will not be used')")
-    assert said.count("(unreadable)") == min(count, 4) and ("and 2 more." in said) == (count == 6)
+        tab.wait_for_selector("button:has-text('Leave 6 out and go on')")
+        said = {6: tab.inner_text("p:has-text('Will not be used')")}
+        for count in (1, 4):
+            bad = [{"name": f"photos/IMG_{number}.jpg", "remarks": [["unreadable", ""]]} for number in range(count)]
+            said[count] = tab.evaluate("async (bad) => (await import('/upload.js')).unused(bad)", bad)
+    for count, words in said.items():
+        assert words.count("(unreadable)") == min(count, 4) and ("and 2 more." in words) == (count == 6)
 
 
 @pytest.mark.parametrize(

@@ -146,17 +146,17 @@ def test_a_scene_in_its_own_unit_is_not_given_in_millimetres(finished_run, tmp_p
 
 def test_the_picture_of_a_ball_covers_a_disc_and_is_brighter_where_the_light_comes_from():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=10.0)
-    picture = mesh_picture(ball, np.array([1.0, -1.0, 0.5]), (120, 80), reach=20.0)
+    picture = mesh_picture(ball, np.array([1.0, -1.0, 0.5]), (120, 80))
     cover = picture[..., 3].sum() / 255
-    assert cover == pytest.approx(np.pi * 20.0**2, rel=0.03), "10 mm at 2 px per mm, and a quarter pixel"
-    assert picture[30, 50, 0] > picture[50, 70, 0] + 40
+    assert cover == pytest.approx(np.pi * (40.0 / 1.04) ** 2, rel=0.03), "it fills the height, but for a margin"
+    assert picture[21, 41, 0] > picture[59, 79, 0] + 40
 
 
 def test_the_nearer_surface_hides_the_farther_one():
     near, far = trimesh.creation.box((2, 2, 2)), trimesh.creation.box((8, 8, 2))
     near.apply_translation((0, -10, 0))
     near.visual.vertex_colors, far.visual.vertex_colors = [255, 0, 0, 255], [0, 0, 255, 255]
-    picture = mesh_picture(trimesh.util.concatenate([far, near]), np.array([0.0, -1.0, 0.001]), (100, 100), reach=5.0)
+    picture = mesh_picture(trimesh.util.concatenate([far, near]), np.array([0.0, -1.0, 0.001]), (100, 100))
     assert picture[50, 50, 0] > 100 and picture[50, 50, 2] == 0
     assert picture[50, 80, 2] > 100 and picture[50, 80, 0] == 0
 

@@ -17,16 +17,8 @@ from reconstruct.run_folder.lock import is_abandoned
 from reconstruct.run_folder.requests import PAUSED, make_request, open_requests
 from reconstruct.sdf.grid import SdfGrid
 from viewer.display.run_follower import RunFollower
-from viewer.page.guard import GuardedServer
 from viewer.page.page import Page
-from viewer.report.pictures import Comparison, compare_result, is_shadow_picture
-
-
-@pytest.fixture(scope="module")
-def server():
-    guarded = GuardedServer("127.0.0.1", 0)
-    yield guarded
-    guarded.stop()
+from viewer.report.pictures import computed_picture, is_shadow_picture
 
 
 @pytest.fixture
@@ -63,11 +55,11 @@ def test_each_button_makes_its_request_and_the_page_says_what_becomes_of_it(page
     press(run._pause)
     assert open_requests(tmp_path) == {"pause"}
     page.refresh()
-    assert run._go_on.visible and not run._pause.visible and "Asked for: a pause" in page.controls.status_html()
+    assert run._go_on.visible and not run._pause.visible and "Asked for: a pause" in page.controls._status.content
     fake_run.log_line(tmp_path, 50.0, "solve", 36, 120, f"{PAUSED}go on with the button")
     page.refresh()
-    assert "Paused while fitting the surface" in page.controls.status_html()
-    assert "waits until somebody goes on" in page.controls.status_html()
+    assert "Paused while fitting the surface" in page.controls._status.content
+    assert "waits until somebody goes on" in page.controls._status.content
     press(run._go_on)
     press(run._next)
     press(run._stop)
@@ -93,11 +85,9 @@ def test_a_killed_run_counts_as_stopped_and_a_pause_left_over_is_named(page, tmp
     make_request(tmp_path, "pause")
     (tmp_path / "lock").write_text(json.dumps(gone()))
     page.refresh()
-    assert page.is_over and "Stopped while fitting the surface" in page.controls.status_html()
-    run = page.controls.steering
-    assert (
-        "The same command goes on" in page.controls.status_html() and "is forgotten then" in page.controls.status_html()
-    )
+    assert page.is_over and "Stopped while fitting the surface" in page.controls._status.content
+    run, said = page.controls.steering, page.controls._status.content
+    assert "The same command goes on" in said and "is forgotten then" in said
     assert not any(control.visible for control in (run._pause, run._go_on, run._next, run._stop, run._resolution))
 
 
@@ -134,28 +124,19 @@ def moved(grid: SdfGrid, by: float) -> SdfGrid:
     return SdfGrid(grid.values, origin, grid.spacing)
 
 
-def test_the_right_surface_explains_a_photo_and_a_wrong_one_does_not(truth):
+def gap(one: np.ndarray, other: np.ndarray) -> float:
+    """What 95 % of the pixels differ by less than, of white."""
+    return float(np.percentile(np.abs(one.astype(float).mean(-1) - other.mean(-1)) / 255, 95))
+
+
+def test_a_photo_is_explained_by_the_right_surface_and_a_shadow_picture_by_where_light_arrives(truth):
     calibration, fields = fake_run.calibration_of(truth), fake_run.fields_of(truth)
     name = calibration.lights[3].photo
     photo = thumbs_of(truth, calibration)[name]
-    right = compare_result(fields, calibration, name, photo)
-    wrong = compare_result(replace(fields, grid=moved(fields.grid, 12.0)), calibration, name, photo)
-    assert right and wrong and gap(right) < 0.05 < 0.1 < gap(wrong)
-    assert right.difference.shape == right.photo.shape == right.computed.shape
-
-
-def gap(found: Comparison) -> float:
-    """What 95 % of the pixels differ by less than, of white."""
-    return float(np.percentile(np.abs(found.photo.astype(float).mean(-1) - found.computed.mean(-1)) / 255, 95))
-
-
-def test_a_shadow_picture_is_compared_with_where_light_arrives(truth):
-    calibration, fields = fake_run.calibration_of(truth), fake_run.fields_of(truth)
-    name = calibration.lights[3].photo
-    lit = compare_result(fields, calibration, name, thumbs_of(truth, calibration)[name])
-    assert lit is not None and not is_shadow_picture(lit.photo)
-    black_and_white = np.repeat(np.where(lit.computed.mean(-1, keepdims=True) > 25, 255, 0), 3, -1).astype(np.uint8)
-    assert is_shadow_picture(black_and_white)
-    found = compare_result(fields, calibration, name, black_and_white)
-    assert found is not None and is_shadow_picture(found.computed)
-    assert float((found.computed != black_and_white).mean()) < 0.05
+    computed = computed_picture(fields, calibration, name, photo)
+    wrong = computed_picture(replace(fields, grid=moved(fields.grid, 12.0)), calibration, name, photo)
+    assert gap(photo, computed) < 0.05 < 0.1 < gap(photo, wrong) and not is_shadow_picture(photo)
+    black_and_white = np.repeat(np.where(computed.mean(-1, keepdims=True) > 25, 255, 0), 3, -1).astype(np.uint8)
+    found = computed_picture(fields, calibration, name, black_and_white)
+    assert is_shadow_picture(black_and_white) and is_shadow_picture(found)
+    assert float((found != black_and_white).mean()) < 0.05

@@ -1,17 +1,15 @@
 """The stage in one file, opened from a file in a real browser and compared with our own renderer."""
 
-import io
 import json
 import shutil
-import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from chromium import stage_picture, wait_until
 from scipy.spatial import KDTree
-from waiting import PATIENCE_S
 
 from calibration.camera import Camera
 from calibration.light import Light
@@ -22,9 +20,9 @@ from reconstruct.export.export import export
 from reconstruct.export.first_view import LAMP as FIRST_LAMP
 from reconstruct.export.first_view import SKY
 from reconstruct.export.stage_scene import stage_scene
-from reconstruct.render.g_buffer import look
+from reconstruct.render.g_buffer import RenderView, look
 from reconstruct.render.relight import lit_share, relight
-from reconstruct.render.studio import FOCAL_HEIGHTS, Studio, looking_at, studio_of, towards
+from reconstruct.render.studio import FOCAL_HEIGHTS, looking_at, studio_of, towards
 from reconstruct.stored_run.stage_document import EMPTY, save_stage_document
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.report.formats import FORMATS
@@ -39,11 +37,6 @@ LAMP = {"azimuth": 2.4, "elevation": 0.8, "distance": 600.0, "radius": 0.0, "str
 def page_file(run):
     assert "html" in FORMATS
     return export(run, "html").path
-
-
-@pytest.fixture(scope="module")
-def stage(run) -> Studio:
-    return studio_of(np.asarray(StoredRun(run).mesh.bounds))
 
 
 # --- what is packed --------------------------------------------------------------------------------------------------
@@ -81,22 +74,11 @@ def tab(browser, page_file):
     return page
 
 
-def drawn(tab, samples: int = 1) -> np.ndarray:
-    """sRGB of the canvas once each pixel has so many samples."""
-    end = time.monotonic() + PATIENCE_S
-    while tab.evaluate("window.shadowgraph ? shadowgraph.state().samples : 0") < samples:
-        assert time.monotonic() < end, f"waited in vain; the page says {tab.said}"
-        tab.wait_for_timeout(50)
-    return np.asarray(Image.open(io.BytesIO(tab.locator("canvas").screenshot())).convert("RGB"))
-
-
 def drawn_until(tab, is_right: Callable[[np.ndarray], bool]) -> np.ndarray:
     """sRGB of the canvas as soon as it is what is waited for."""
-    end = time.monotonic() + PATIENCE_S
-    while not is_right(picture := drawn(tab).astype(int)):
-        assert time.monotonic() < end, f"waited in vain; the page says {tab.said}"
-        tab.wait_for_timeout(50)
-    return picture
+    pictures = []
+    wait_until(tab, lambda: pictures.append(stage_picture(tab).astype(int)) or is_right(pictures[-1]))
+    return pictures[-1]
 
 
 def differing(one: np.ndarray, other: np.ndarray) -> float:
@@ -104,22 +86,26 @@ def differing(one: np.ndarray, other: np.ndarray) -> float:
     return float((np.abs(one - other).sum(-1) > 60).mean())
 
 
-def shown(tab, view: dict, lamp: dict, samples: int = 1) -> np.ndarray:
-    drawn(tab)
-    tab.evaluate("state => shadowgraph.set(state)", {"view": view, "lamp": lamp})
-    return drawn(tab, samples)
+def view_of(run: Path, view: dict) -> RenderView:
+    """A view of the page by our own renderer."""
+    fields, centre = StoredRun(run).fields, studio_of(np.asarray(StoredRun(run).mesh.bounds)).centre
+    focal = FOCAL_HEIGHTS * HEIGHT
+    camera = Camera(WIDTH, HEIGHT, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+    eye = centre + view["distance"] * towards(view["azimuth"], view["elevation"])
+    return look(fields, None, PosedCamera(camera, looking_at(eye, centre), fields.ground_height))
+
+
+def light_of(run: Path, lamp: dict) -> Light:
+    """A lamp of the page as a light of ours."""
+    centre = studio_of(np.asarray(StoredRun(run).mesh.bounds)).centre
+    place = centre + lamp["distance"] * towards(lamp["azimuth"], lamp["elevation"])
+    return Light("", "point", position=place, power=np.full(3, lamp["strength"] * lamp["distance"] ** 2))
 
 
 @pytest.fixture(scope="module")
-def ours(run, stage):
+def ours(run):
     """The same view and lamp by our own renderer: linear picture, the ground's pixels, their share of light."""
-    focal = FOCAL_HEIGHTS * HEIGHT
-    camera = Camera(WIDTH, HEIGHT, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
-    eye = stage.centre + VIEW["distance"] * towards(VIEW["azimuth"], VIEW["elevation"])
-    fields = StoredRun(run).fields
-    view = look(fields, None, PosedCamera(camera, looking_at(eye, stage.centre), fields.ground_height))
-    place = stage.centre + LAMP["distance"] * towards(LAMP["azimuth"], LAMP["elevation"])
-    light = Light("", "point", position=place, power=np.full(3, LAMP["strength"] * LAMP["distance"] ** 2))
+    view, light = view_of(run, VIEW), light_of(run, LAMP)
     picture = relight(view, light).numpy()
     ground = torch.isfinite(view.maps.depth).numpy() & ~view.maps.mask.numpy()
     scene, mask = stage_scene(StoredRun(run)), view.maps.mask.numpy()
@@ -132,7 +118,7 @@ def ours(run, stage):
 
 @pytest.mark.browser
 def test_it_opens_from_a_file_shows_the_object_and_asks_nobody(tab, page_file):
-    picture = drawn(tab).astype(int)
+    picture = stage_picture(tab).astype(int)
     middle = picture[90:150, 120:200].reshape(-1, 3)
     assert np.ptp(middle, axis=0).min() > 40  # more than one shade
     assert [url for url in tab.asked if not url.startswith("data:")] == [page_file.as_uri()]
@@ -142,14 +128,14 @@ def test_it_opens_from_a_file_shows_the_object_and_asks_nobody(tab, page_file):
 @pytest.mark.browser
 @pytest.mark.slow
 def test_a_place_that_is_tapped_says_which_view_shows_it(tab, ours):
-    shown(tab, {"focal": FOCAL_HEIGHTS, "shift": [0, 0]}, LAMP)
+    stage_picture(tab, view={"focal": FOCAL_HEIGHTS, "shift": [0, 0]}, lamp=LAMP)
     tab.evaluate("document.querySelector('#panel').style.display = ''")
     tab.evaluate("document.querySelector('#ask-photos').click()")
     tab.evaluate("document.querySelector('#panel').style.display = 'none'")
     tab.keyboard.press("Enter")  # the cross is in the middle
     assert "Shown best by" in tab.locator("#hint").inner_text()
     behind = tab.evaluate("shadowgraph.state().view.azimuth") + np.pi
-    shown(tab, {"azimuth": behind, "elevation": 0.2}, LAMP)
+    stage_picture(tab, view={"azimuth": behind, "elevation": 0.2}, lamp=LAMP)
     tab.keyboard.press("Enter")  # the cross is in the middle
     assert tab.locator("#hint").inner_text() == "None of 1 view shows this place."
     tab.keyboard.press("Escape")
@@ -158,7 +144,7 @@ def test_a_place_that_is_tapped_says_which_view_shows_it(tab, ours):
 @pytest.mark.browser
 def test_shadows_on_the_ground_are_where_our_renderer_puts_them(tab, ours):
     _, ground, share, view = ours
-    linear = decode_srgb(shown(tab, VIEW, LAMP))
+    linear = decode_srgb(stage_picture(tab, view=VIEW, lamp=LAMP))
     glow = SKY * LAMP["strength"] / FIRST_LAMP * view.albedo.numpy()
     theirs = ground & (linear.sum(-1) < 1.5 * glow.sum(-1))
     wanted = ground & (share < 0.5)
@@ -169,7 +155,7 @@ def test_shadows_on_the_ground_are_where_our_renderer_puts_them(tab, ours):
 @pytest.mark.browser
 def test_pixels_of_the_object_have_our_renderers_brightness(tab, ours):
     picture, _, _, view = ours
-    there = shown(tab, VIEW, LAMP)
+    there = stage_picture(tab, view=VIEW, lamp=LAMP)
     mask = view.maps.mask.numpy()
     difference = np.abs(decode_srgb(there) - np.clip(picture, 0, 1)).mean(-1)
     assert np.median(difference[mask]) < 0.01
@@ -178,7 +164,7 @@ def test_pixels_of_the_object_have_our_renderers_brightness(tab, ours):
 
 @pytest.mark.browser
 def test_the_light_follows_the_mouse_and_dragging_turns_the_view(tab):
-    before = shown(tab, VIEW, LAMP).astype(int)
+    before = stage_picture(tab, view=VIEW, lamp=LAMP).astype(int)
     tab.mouse.move(160, 120)
     tab.mouse.move(260, 60, steps=4)
     moved = tab.evaluate("shadowgraph.state()")
@@ -194,7 +180,7 @@ def test_the_light_follows_the_mouse_and_dragging_turns_the_view(tab):
 @pytest.mark.browser
 @pytest.mark.slow
 def test_cutting_away_the_object_shows_and_undo_brings_it_back(tab):
-    before = shown(tab, VIEW, LAMP).astype(int)
+    before = stage_picture(tab, view=VIEW, lamp=LAMP).astype(int)
     tab.evaluate("document.getElementById('crop-high-2').value = '20'")  # everything above 20 mm
     tab.evaluate("document.getElementById('crop-high-2').dispatchEvent(new Event('change'))")
     drawn_until(tab, lambda now: differing(now, before) > 0.02)

@@ -88,9 +88,9 @@ def test_titles_trash_and_return_survive_a_restart(folder):
         assert owner.get("/api/state")[1]["trash"] == []
 
 
-def test_a_run_waits_runs_and_finishes_and_a_capture_that_runs_is_not_deleted(folder, program):
+def test_a_run_waits_runs_and_finishes_and_a_capture_that_runs_is_not_deleted(folder):
     capture_in(folder, "vase")
-    with served(folder, program) as (studio, _, owner):
+    with served(folder) as (studio, _, owner):
         first = owner.ok("start", key="vase", preset="draft")
         second = owner.ok("start", key="vase", preset="draft")
         assert (first, second) == ("runs/vase-draft", "runs/vase-draft-2")

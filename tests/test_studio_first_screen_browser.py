@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from chromium import wait_until
+from chromium import STATE, wait_until
 from studio_client import served
 from test_studio import capture_in, run_in
 from test_studio_browser import DESKTOP, PHONE, RULES, opened
@@ -14,8 +14,10 @@ from capture.session.skipped import photos_of
 from reconstruct.stored_run.stage_pack import opened_pack
 from viewer.studio import example, studio
 
-STATE = "window.shadowgraph ? window.shadowgraph.state() : null"
 SMALL = {"width": 1000, "height": 640}
+TITLE = "Übung & 1"
+PAGES = {"": ".card", "capture/vase": "text=Let phones in", "run/runs%2Fvase": "text=Its photos"}
+PAGES |= {"run/runs%2Fheap": "section.save"}
 
 
 def stage_of(tab):
@@ -35,8 +37,8 @@ def test_the_example_that_ships_is_small_and_of_the_stage_as_it_is():
     assert example.RESULT.stat().st_size < 500_000
 
 
-def test_the_example_is_a_capture_and_a_run_of_its_own_each_time(tmp_path, program):
-    with served(tmp_path, program) as (_, _, owner):
+def test_the_example_is_a_capture_and_a_run_of_its_own_each_time(tmp_path):
+    with served(tmp_path) as (_, _, owner):
         runs = [owner.ok("try_example") for _ in range(3)]
         cards = {card["key"]: card for card in owner.get("/api/state")[1]["cards"]}
     assert len(set(runs)) == len(cards) == 3
@@ -55,111 +57,99 @@ def test_an_installation_without_the_examples_photos_says_so(tmp_path, monkeypat
     assert status == 400 and "did not come" in answer["error"] and not (tmp_path / "captures").exists()
 
 
-@pytest.mark.parametrize("size", [PHONE, SMALL], ids=["phone", "small"])
 @pytest.mark.browser
-def test_an_empty_studio_shows_a_result_that_the_pointer_lights(browser, tmp_path, size):
+def test_an_empty_studio_shows_a_result_that_the_pointer_lights(browser, tmp_path):
     with served(tmp_path) as (_, _, owner):
-        tab, bad = opened(browser, owner, size, is_drawn=False)
+        tab, bad = opened(browser, owner, PHONE, is_drawn=False)
         stage = stage_of(tab)
-        box = tab.locator("iframe.result").bounding_box()
-        before = stage.evaluate(STATE)["lamp"]
-        tab.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.6 * box["height"])
-        tab.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 0.5 * box["height"], steps=3)
-        wait_until(tab, lambda: stage.evaluate(STATE)["lamp"]["azimuth"] != before["azimuth"])
-        for words in ("New capture", "Try the example"):
-            place = tab.locator(f"button:has-text('{words}')").bounding_box()
-            assert place["y"] + place["height"] < size["height"], f"{words} is below the first screen"
-        assert not tab.evaluate(RULES) and not bad
+        for size in (PHONE, SMALL):
+            tab.set_viewport_size(size)
+            box = tab.locator("iframe.result").bounding_box()
+            before = stage.evaluate(STATE)["lamp"]
+            tab.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.6 * box["height"])
+            tab.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 0.5 * box["height"], steps=3)
+            wait_until(tab, lambda b=before: stage.evaluate(STATE)["lamp"]["azimuth"] != b["azimuth"])
+            for words in ("New capture", "Try the example"):
+                place = tab.locator(f"button:has-text('{words}')").bounding_box()
+                assert place["y"] + place["height"] < size["height"], f"{words} is below the first screen"
+            assert not tab.evaluate(RULES) and not bad
 
 
 # --- a result --------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def folder(studio_folder):
+def page(browser, studio_folder):
+    """One page of a studio with a capture, a run that stopped and a result; and what it complained about."""
     capture_in(studio_folder, "vase")
     run_in(studio_folder, "vase", is_finished=False, message="a level")
-    return studio_folder
+    with served(studio_folder) as (_, _, owner):
+        owner.ok("rename", key="runs/heap", title=TITLE)
+        yield opened(browser, owner, DESKTOP, is_drawn=False)
 
 
-def result_of(browser, owner, size):
-    tab, bad = opened(browser, owner, size, is_drawn=False)
-    tab.goto(f"http://127.0.0.1:{owner.port}/#/run/runs%2Fheap")
-    return tab, bad, stage_of(tab)
-
-
-@pytest.mark.browser
-def test_one_click_makes_and_downloads_the_page_under_the_title(browser, folder):
-    with served(folder) as (_, _, owner):
-        title = "Übung & 1"
-        owner.ok("rename", key="runs/heap", title=title)
-        tab, bad, _ = result_of(browser, owner, DESKTOP)
-        with tab.expect_download() as download:
-            tab.click("button:has-text('Share')")
-        assert download.value.suggested_filename == f"{title}.html"
-        page = Path(download.value.path()).read_text()
-        assert "connect-src 'none'" in page and not bad
-        tab.wait_for_selector("button:has-text('Share'):not([disabled])")
-        tab.close()
+@pytest.fixture
+def result(page):
+    """The page where it shows the result, and the frame of that."""
+    tab, bad = page
+    tab.evaluate("location.hash = '#/run/runs%2Fheap'")
+    yield tab, stage_of(tab)
+    assert not bad
 
 
 @pytest.mark.browser
-def test_keys_reach_the_result_while_a_button_has_the_focus(browser, folder):
-    button = "Rename"
-    with served(folder) as (_, _, owner):
-        tab, bad, stage = result_of(browser, owner, SMALL)
-        tab.locator(f".bar > :has-text('{button}')").focus()
-        for keys, part, name in (
-            ("ArrowRight", "lamp", "azimuth"),
-            ("Shift+ArrowRight", "view", "azimuth"),
-            ("+", "view", "focal"),
-            ("2", "shown", "look"),
-        ):
-            before = stage.evaluate(STATE)
-            tab.keyboard.press(keys)
-            wait_until(tab, lambda b=before, p=part, n=name: stage.evaluate(STATE)[p][n] != b[p][n])
-        assert button in tab.evaluate("document.activeElement.innerText") and not bad
+def test_one_click_makes_and_downloads_the_page_under_the_title(result):
+    tab, _ = result
+    with tab.expect_download() as download:
+        tab.click("button:has-text('Share')")
+    assert download.value.suggested_filename == f"{TITLE}.html"
+    assert "connect-src 'none'" in Path(download.value.path()).read_text()
+    tab.wait_for_selector("button:has-text('Share'):not([disabled])")
 
 
 @pytest.mark.browser
-def test_a_question_mark_lists_the_keys_and_the_picture_alone_fills_the_window(browser, folder):
-    with served(folder) as (_, _, owner):
-        tab, bad, stage = result_of(browser, owner, PHONE)
-        tab.focus("button:has-text('Rename')")
-        tab.keyboard.press("?")
-        wait_until(tab, lambda: stage.evaluate("document.querySelector('dialog[open]') !== null"))
-        tab.keyboard.press("Escape")
-        wait_until(tab, lambda: stage.evaluate("document.querySelector('dialog[open]') === null"))
-        tab.click("button:has-text('Fill the window')")
-        wait_until(tab, lambda: tab.evaluate("document.fullscreenElement !== null"))
-        assert tab.evaluate("document.fullscreenElement.className") == "result" and not bad
+def test_keys_reach_the_result_while_a_button_has_the_focus(result):
+    tab, stage = result
+    tab.locator(".bar > :has-text('Rename')").focus()
+    for keys, part, name in (
+        ("ArrowRight", "lamp", "azimuth"),
+        ("Shift+ArrowRight", "view", "azimuth"),
+        ("+", "view", "focal"),
+        ("2", "shown", "look"),
+    ):
+        before = stage.evaluate(STATE)
+        tab.keyboard.press(keys)
+        wait_until(tab, lambda b=before, p=part, n=name: stage.evaluate(STATE)[p][n] != b[p][n])
+    assert "Rename" in tab.evaluate("document.activeElement.innerText")
+    tab.keyboard.press("?")
+    wait_until(tab, lambda: stage.evaluate("document.querySelector('dialog[open]') !== null"))
+    tab.keyboard.press("Escape")
+    wait_until(tab, lambda: stage.evaluate("document.querySelector('dialog[open]') === null"))
 
 
-@pytest.mark.parametrize("width, height", [(360, 640), (1000, 640)])
 @pytest.mark.browser
-def test_nothing_to_press_stands_before_the_model(browser, folder, width, height):
-    with served(folder) as (_, _, owner):
-        tab, bad, _ = result_of(browser, owner, {"width": width, "height": height})
+def test_nothing_to_press_stands_before_the_model_and_it_alone_fills_the_window(result):
+    tab, _ = result
+    for width, height in ((360, 640), (1000, 640)):
+        tab.set_viewport_size({"width": width, "height": height})
         model = tab.locator("iframe.result").bounding_box()
         assert model["y"] < 0.2 * height and model["height"] > 0.6 * height
         tops = tab.eval_on_selector_all(
             "main button, main a.button", "all => all.map(e => e.getBoundingClientRect().top)"
         )
-        assert min(tops) >= model["y"] + model["height"] and not tab.evaluate(RULES) and not bad
+        assert min(tops) >= model["y"] + model["height"] and not tab.evaluate(RULES)
+    tab.click("button:has-text('Fill the window')")
+    wait_until(tab, lambda: tab.evaluate("document.fullscreenElement !== null"))
+    assert tab.evaluate("document.fullscreenElement.className") == "result"
+    tab.evaluate("document.exitFullscreen()")
 
 
-@pytest.mark.parametrize("scheme", ["dark", "light"])
 @pytest.mark.browser
-def test_every_text_stands_out_also_on_buttons_that_cannot_be_pressed(browser, folder, scheme):
-    with served(folder) as (_, _, owner):
-        tab, _ = opened(browser, owner, DESKTOP, is_drawn=False)
-        tab.emulate_media(color_scheme=scheme)
-        for page, ready in {
-            "": ".card",
-            "capture/vase": "section.panel",
-            "run/runs%2Fvase": "h2",
-            "run/runs%2Fheap": ".save",
-        }.items():
-            tab.goto(f"http://127.0.0.1:{owner.port}/#/{page}")
-            tab.wait_for_selector(f"main {ready}")
-            assert not tab.evaluate(RULES), page
+def test_every_text_stands_out_also_on_buttons_that_cannot_be_pressed(page):
+    tab, _ = page
+    for place, ready in PAGES.items():
+        tab.evaluate(f"location.hash = '#/{place}'")
+        tab.wait_for_selector(ready)
+        for scheme in ("dark", "light"):
+            tab.emulate_media(color_scheme=scheme)
+            assert not tab.evaluate(RULES), (place, scheme)

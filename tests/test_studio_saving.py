@@ -1,7 +1,6 @@
 """What the studio makes of runs: files to keep, a picture of one under way, and what waits in the queue costs."""
 
 import io
-import sys
 from urllib.parse import quote
 
 import fake_run
@@ -10,7 +9,6 @@ import pytest
 import trimesh
 from PIL import Image
 from studio_client import Client, served
-from test_queue import PROGRAM
 from test_studio import capture_in
 from waiting import wait_until
 
@@ -145,13 +143,10 @@ def test_a_run_under_way_shows_its_photos_and_then_the_growing_surface(tmp_path,
 
 
 def test_the_queue_says_what_each_run_costs_and_what_is_left(tmp_path, monkeypatch):
-    file = tmp_path / "program.py"
-    file.write_text(PROGRAM.replace("seconds = sys.argv[7]", 'seconds = "30"'))
-    folder = tmp_path / "studio"
-    capture_in(folder, "vase")
+    capture_in(tmp_path, "vase")
     predicted = [{"name": name, "seconds": 60.0, "bytes": 1e9, "fits": True} for name in ("draft", "standard")]
     monkeypatch.setattr(Studio, "presets", lambda *_: {"presets": predicted})
-    with served(folder, (sys.executable, str(file))) as (studio, _, owner):
+    with served(tmp_path, run_s="30") as (studio, _, owner):
         owner.ok("start", key="vase", preset="draft")
         owner.ok("start", key="vase", preset="standard")
         wait_until(lambda: any(job.state == "running" for job in studio.queue.jobs))

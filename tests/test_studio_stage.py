@@ -4,8 +4,9 @@ import json
 from concurrent.futures import Future
 
 import pytest
-from chromium import PATIENCE_MS, wait_until
+from chromium import wait_until
 from studio_client import Client, served
+from test_studio_browser import opened
 
 from reconstruct.export.export import export
 from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
@@ -69,15 +70,8 @@ def test_a_damaged_pack_or_one_of_another_solve_counts_as_none(studio_folder, tm
 def test_a_note_made_in_the_studio_is_kept_with_the_run_and_goes_with_its_export(browser, studio_folder, tmp_path):
     run = studio_folder / "runs" / "heap"
     with served(studio_folder) as (_, _, owner):
-        address = f"http://127.0.0.1:{owner.port}"
-        context = browser.new_context(viewport={"width": 1200, "height": 800})
-        name, _, value = owner.cookie.partition("=")
-        context.add_cookies([{"name": name, "value": value, "url": address}])
-        tab, said = context.new_page(), []
-        tab.set_default_timeout(PATIENCE_MS)
-        tab.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
-        tab.on("pageerror", lambda error: said.append(str(error)))
-        tab.goto(f"{address}/#/run/{'runs%2Fheap'}")
+        tab, said = opened(browser, owner, {"width": 1200, "height": 800})
+        tab.goto(f"http://127.0.0.1:{owner.port}/#/run/runs%2Fheap")
         frame = tab.frame_locator("iframe.result")
         tab.focus("section.save select")  # before the stage is there
         frame.locator("summary:has-text('Notes and views')").wait_for(state="attached")
@@ -87,7 +81,6 @@ def test_a_note_made_in_the_studio_is_kept_with_the_run_and_goes_with_its_export
         frame.locator("#save-view").press("Enter")
         wait_until(tab, lambda: (run / "stage.json").exists())
         assert not said
-        context.close()
     found = read_stage_document(run)
     assert found is not None and [view["name"] for view in found["views"]] == ["View 1"]
     assert "html" in FORMATS and '"name":"View 1"' in export(run, "html", tmp_path / "it.html").path.read_text()

@@ -5,14 +5,13 @@ The draft is a real one, but brief. A picture of each step lies in the test's fo
 
 import pytest
 from brief_drafts import ENVIRONMENT, brief_command
-from chromium import PATIENCE_MS, wait_until
+from chromium import PATIENCE_MS, STATE, wait_until
 from small_example import small_example
 from studio_client import served
 from test_studio import capture_in
 from test_studio_browser import DESKTOP, PHONE, RULES, opened
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
-STATE = "window.shadowgraph ? window.shadowgraph.state() : null"
 
 
 def finished_stage(tab):
@@ -121,10 +120,10 @@ def press_until(tab, words: str, frame=None) -> None:
     raise AssertionError(f"{words} cannot be reached by the keyboard, only {passed}")
 
 
-def test_the_keyboard_alone_starts_a_run_and_lights_turns_and_edits_a_result(browser, finished_run, tmp_path, program):
+def test_the_keyboard_alone_starts_a_run_and_lights_turns_and_edits_a_result(browser, finished_run, tmp_path):
     finished_run(tmp_path / "runs", has_stage=True)
     capture_in(tmp_path, "vase")
-    with served(tmp_path, program) as (_, _, owner):
+    with served(tmp_path) as (_, _, owner):
         tab, bad = opened(browser, owner, DESKTOP)
         tab.wait_for_selector(".card")
         press_until(tab, "vase")

@@ -29,16 +29,16 @@ def test_a_title_is_a_name_that_every_system_takes(title, name):
     assert as_name(title, "it") == name and len(name.encode()) < 250
 
 
-@pytest.mark.parametrize("title", ["A cup / of tea: <b>", "猫" * 100])
-def test_the_title_that_was_typed_is_on_the_card_the_run_in_the_queue_and_after_a_restart(tmp_path, program, title):
-    with served(tmp_path, program) as (_, _, owner):
+def test_the_title_that_was_typed_is_on_the_card_the_run_in_the_queue_and_after_a_restart(tmp_path):
+    title = "A cup / of tea: <b> " + "猫" * 80
+    with served(tmp_path) as (_, _, owner):
         capture = owner.ok("new", title=f"  {title} ")
         run = owner.ok("start", key=capture, preset="draft")
         (card,) = owner.get("/api/state")[1]["cards"]
         assert card["title"] == title and [row["title"] for row in card["runs"]] == [title]
         assert owner.get(f"/api/capture?key={quote(capture)}")[1]["title"] == title
         assert Path(run).name.endswith("-draft")
-    with served(tmp_path, program) as (_, _, owner):
+    with served(tmp_path) as (_, _, owner):
         assert owner.get("/api/state")[1]["cards"][0]["title"] == title
 
 
@@ -55,9 +55,8 @@ def test_a_run_that_has_none_gets_the_title_of_its_capture_and_keeps_its_own(tmp
     assert [title_of(run) for run in runs] == ["Übung 1", "The second"]
 
 
-@pytest.mark.parametrize("title", ["A <cup> & {{scene}}", "🏺 vase"])
-def test_results_reports_pages_and_files_have_the_title(finished_run, tmp_path, title):
-    run = finished_run(tmp_path, has_stage=True)
+def test_results_reports_pages_and_files_have_the_title(finished_run, tmp_path):
+    run, title = finished_run(tmp_path, has_stage=True), "🏺 A <cup> & {{scene}}"
     assert StoredRun(run).name == "heap" and default_file(run, "glb").name == "heap.glb"
     keep_title(run, title)
     assert StoredRun(run).name == read_results(run).name == title
@@ -71,11 +70,9 @@ def test_results_reports_pages_and_files_have_the_title(finished_run, tmp_path, 
 def test_a_file_to_download_is_called_as_its_run_is_now(finished_run, tmp_path):
     finished_run(tmp_path / "runs")
     with served(tmp_path) as (_, _, owner):
-        for title in ("Übung 1", "A cup / of tea", "vase"):
-            owner.ok("rename", key=RUN, title=title)
-            assert made(owner, "off")["file"] == f"{as_name(title, '')}.off"
-            told = owner.raw("GET", address("off")).headers["Content-Disposition"]
-            assert quote(f"{as_name(title, '')}.off") in told or f'"{title}.off"' in told
+        owner.ok("rename", key=RUN, title="Übung / 1")
+        assert made(owner, "off")["file"] == "Übung - 1.off"
+        assert quote("Übung - 1.off") in owner.raw("GET", address("off")).headers["Content-Disposition"]
 
 
 @pytest.mark.parametrize("content", [b"", b" \n\t ", b"\x00\x07", b"x" * 100_000, b"\xff\xfe"])

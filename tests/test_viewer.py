@@ -1,4 +1,5 @@
 from pathlib import Path
+from types import SimpleNamespace
 
 import fake_run
 import numpy as np
@@ -18,26 +19,17 @@ from viewer.display.layers import (
 )
 from viewer.display.run_follower import RunFollower, loss_curves, size_text, status
 from viewer.page.controls import continued
-from viewer.page.guard import GuardedServer
 from viewer.page.page import MIN_INTERVAL_S, Page, RateLimit
 
 ROOT = Path(__file__).parent.parent
-ANY_PORT = 0
-
-
-@pytest.fixture(scope="module")
-def server():
-    guarded = GuardedServer("127.0.0.1", ANY_PORT)
-    yield guarded
-    guarded.stop()
 
 
 def test_the_status_says_stage_count_and_time_left():
     now = status(
         [{"t": 9, "stage": "solve/64", "done": 34, "total": 120, "eta_s": 40.0, "message": "grid of 64"}], True
     )
-    assert (now.title, now.counts, now.eta_s, now.is_over) == ("Fitting the surface", "34 of 120", 40.0, False)
-    assert now.fraction == pytest.approx(34 / 120)
+    assert (now.title, now.counts, now.left_s, now.is_over) == ("Fitting the surface", "34 of 120", 40.0, False)
+    assert now.share == pytest.approx(34 / 120)
 
 
 # --- following a run -------------------------------------------------------------------------------------------------
@@ -108,15 +100,15 @@ def test_a_folder_in_which_nothing_changes_has_no_news(tmp_path):
     assert follower.has_news()
 
 
-def test_a_growing_mesh_is_sent_again_when_it_is_another_and_its_time_has_come(tmp_path, truth, server):
+def test_a_growing_mesh_is_sent_again_when_it_is_another_and_its_time_has_come(tmp_path, truth, server, monkeypatch):
+    monkeypatch.setattr("viewer.page.page.MIN_INTERVAL_S", 1e9)
     fake_run.start_run(tmp_path, truth)
     page = Page(tmp_path, server)
-    page._mesh_limit = RateLimit(clock=lambda: 0.0)
     page.refresh()
     first = page._mesh
     fake_run.mesh_of(fake_run.fields_of(truth), inflate=3.0).export(tmp_path / "preview.ply")
     page.refresh()
-    assert page._mesh is first, "its clock stands still: two seconds have not passed"
+    assert page._mesh is first, "its time has not come"
     page._mesh_limit = RateLimit()
     page.poll()
     second = page._mesh
@@ -175,11 +167,11 @@ def test_the_page_follows_a_run_from_nothing_to_the_way_to_its_stage(tmp_path, t
     assert not page.is_over and page._lamp is None
     fake_run.start_run(tmp_path, truth)
     page.refresh()
-    assert "Fitting the surface" in page.controls.status_html() and "/stage/" not in page.controls.status_html()
+    assert "Fitting the surface" in page.controls._status.content and "/stage/" not in page.controls._status.content
     np.testing.assert_allclose(page._lamp.handle.position, light_position(page._lights[0].light, page._scale))
     fake_run.finish_run(tmp_path, truth)
     page.refresh()
-    assert page.is_over and "/stage/" in page.controls.status_html() and " mm" in page.controls.status_html()
+    assert page.is_over and "/stage/" in page.controls._status.content and " mm" in page.controls._status.content
     page.choose_photo(4)
     np.testing.assert_allclose(page._lamp.handle.position, light_position(page._lights[4].light, page._scale))
     assert truth.calibration.lights[4].photo in page.controls._caption.content
@@ -203,9 +195,10 @@ def test_a_damaged_file_does_not_end_the_page(tmp_path, truth, server):
     assert "calibration.json" in page.problem
 
 
-def test_the_first_mesh_is_due_at_once_and_a_cheap_one_every_two_seconds():
+def test_the_first_mesh_is_due_at_once_and_a_cheap_one_every_two_seconds(monkeypatch):
     now = [100.0, 7.0]  # a clock and an account of CPU seconds
-    limit = RateLimit(lambda: now[0], lambda: now[1])
+    monkeypatch.setattr("viewer.page.page.time", SimpleNamespace(monotonic=lambda: now[0], process_time=lambda: now[1]))
+    limit = RateLimit()
     assert limit.is_due()
     limit.begin()
     now[1] += 0.01

@@ -106,6 +106,14 @@ def read_as(path: Path, kind: type[Kind], advice: str = CORRECT) -> tuple[Kind, 
     return as_type(value, kind, str(path), advice), value
 
 
+def read_kept(path: Path, kind: type[Kind]) -> Kind | None:
+    """Return a JSON file that the program keeps for itself as a type; None where it is missing or damaged."""
+    try:
+        return read_as(path, kind)[0]
+    except UserError:
+        return None
+
+
 def read_text(path: Path) -> str:
     """Read a text file, without its byte-order mark; bytes that are not UTF-8 become replacement characters.
 

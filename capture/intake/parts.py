@@ -19,9 +19,9 @@ from msgspec import Meta
 
 from capture.decode.formats import is_photo_name
 from capture.errors import CaptureError, UserError
-from capture.files.atomic import read_json, write_json
+from capture.files.atomic import write_json
 from capture.files.regular import why
-from capture.files.schema import Number, as_type
+from capture.files.schema import Number, read_kept
 from capture.intake.archive import unpack
 from capture.intake.arrivals import (
     MOST_FILES,
@@ -258,10 +258,7 @@ class Parts:
 
 def _read(path: Path) -> Part | None:
     """Return what was noted of a file; None for another file, or one that was lost."""
-    try:
-        part = as_type(read_json(path), Part, str(path))
-    except (OSError, ValueError, UserError):
-        return None
-    if path.stem != part.id or not _ID.fullmatch(part.id):
+    part = read_kept(path, Part)
+    if part is None or path.stem != part.id or not _ID.fullmatch(part.id):
         return None
     return part if part.is_over or path.with_suffix(".part").is_file() else None

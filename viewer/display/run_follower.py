@@ -43,9 +43,9 @@ class Status:
 
     title: str
     message: str = ""
-    fraction: float | None = None  # of the whole run, in [0, 1]; None = unknown
+    share: float | None = None  # of the whole run, in [0, 1]; None = unknown
     counts: str = ""  # of the stage, "34 of 120"
-    eta_s: float | None = None  # until the end of the run
+    left_s: float | None = None  # until the end of the run
     elapsed_s: float = 0.0
     is_over: bool = False  # no more is coming
     is_finished: bool = False  # and the result is complete
@@ -144,11 +144,12 @@ def status(lines: list[dict[str, Any]], is_running: bool, since_last_line_s: flo
     A run that planned no time, as that of a trained field, is as far as its stage.
 
     Args:
-        lines: the log so far, whose last line was written since_last_line_s ago.
+        lines: the log so far.
         is_running: whether a process still holds the run.
+        since_last_line_s: seconds since its last line was written, or, without any, since the run was started.
     """
     if not lines:
-        return Status("Starting" if is_running else "Waiting for a run", "The log is still empty.")
+        return Status("Starting", elapsed_s=since_last_line_s) if is_running else Status("Waiting for a run")
     last, forecast = lines[-1], Forecast(lines)
     stage = forecast.stage
     name = STAGE_NAMES.get(stage, stage.capitalize() or "Working")
@@ -165,9 +166,9 @@ def status(lines: list[dict[str, Any]], is_running: bool, since_last_line_s: flo
     forecast.at(elapsed)
     if forecast.left_s is not None:
         return Status(name, message, forecast.share, counts, forecast.left_s, elapsed)
-    eta = last.get("eta_s")
-    fraction = min(done / total, 1.0) if total > 0 else None
-    return Status(name, message, fraction, counts, None if eta is None else float(eta), elapsed)
+    left = last.get("eta_s")
+    share = min(done / total, 1.0) if total > 0 else None
+    return Status(name, message, share, counts, None if left is None else float(left), elapsed)
 
 
 def loss_curves(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, dict[str, np.ndarray]]:

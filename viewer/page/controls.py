@@ -47,9 +47,8 @@ HINTS = {
 }
 MUTED = "opacity:.68;font-size:.82rem"
 BRAND = (214, 137, 16)
-LAYERS = ("Surface", "Shadow hull", "Ground", "Camera", "Lights", "Uncertainty", "Your lamp")
 OFF_AT_FIRST = ("Shadow hull",)
-LAYER_HINTS = {
+LAYERS = {
     "Surface": "The shape found so far, or the finished mesh",
     "Shadow hull": "The space that the shadows on the ground alone allow; the run begins with it",
     "Ground": "The plane the object stands on",
@@ -94,13 +93,9 @@ class Steering:
         """Show the buttons that apply now, and return what the run does about the open requests, in words."""
         asked = open_requests(self._run_dir)
         is_alive = not now.is_over
-        _set_visible(self._go_on, is_alive and PAUSE in asked)
-        _set_visible(self._pause, is_alive and PAUSE not in asked)
-        for control in (self._next, self._stop, self._resolution):
-            _set_visible(control, is_alive)
-        chosen = next((name for name in RESOLUTIONS if name in asked), AS_PLANNED)
-        if self._resolution.value != chosen:
-            self._resolution.value = chosen
+        self._go_on.visible, self._pause.visible = is_alive and PAUSE in asked, is_alive and PAUSE not in asked
+        self._next.visible = self._stop.visible = self._resolution.visible = is_alive
+        self._resolution.value = next((name for name in RESOLUTIONS if name in asked), AS_PLANNED)
         return _answer(now, log, asked)
 
     def _request(self, name: str) -> None:
@@ -133,13 +128,8 @@ def _answer(now: Status, log: Sequence[Mapping[str, Any]], asked: frozenset[str]
     return f"Asked for: {', '.join(open_ones)}. It follows {when}."
 
 
-def _set_visible(control: Any, is_visible: bool) -> None:
-    if control.visible != is_visible:
-        control.visible = is_visible
-
-
 class Controls:
-    """All controls of the page. The `show_*` methods may be called from any thread and send only what changed."""
+    """All controls of the page. The `show_*` methods may be called from any thread; viser sends only what changed."""
 
     def __init__(
         self, host: Host, run_dir: Path, change_layers: Callable[[], None], choose_photo: Callable[[int], None]
@@ -166,7 +156,7 @@ class Controls:
         self._photo: viser.GuiImageHandle | None = None
         self._slider.on_update(lambda event: choose_photo(self.photo_index()) if event.client is not None else None)
         with gui.add_folder("Show", expand_by_default=False):
-            self._layers = {n: gui.add_checkbox(n, n not in OFF_AT_FIRST, hint=LAYER_HINTS[n]) for n in LAYERS}
+            self._layers = {n: gui.add_checkbox(n, n not in OFF_AT_FIRST, hint=hint) for n, hint in LAYERS.items()}
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=BRAND)
         for box in self._layers.values():
             box.on_update(lambda _: self._change_layers())
@@ -182,17 +172,11 @@ class Controls:
         """Return the index of the chosen photo, from 0."""
         return int(self._slider.value) - 1
 
-    def status_html(self) -> str:
-        """Return the status card as it was sent."""
-        return self._status.content
-
     # --- what is shown -----------------------------------------------------------------------------------------------
 
     def follow(self, now: Status, lines: Sequence[Mapping[str, Any]], remark: str, has_picture: bool) -> None:
         """Show stage, n of m, time left and message, the steering, a remark or problem, and the way to the stage."""
-        content = _status_card(now, remark, self.steering.follow(now, lines)) + (TO_STAGE if has_picture else "")
-        if content != self._status.content:
-            self._status.content = content
+        self._status.content = _status_card(now, remark, self.steering.follow(now, lines)) + TO_STAGE * has_picture
 
     def show_photo(self, index: int, count: int, words: str, picture: UInt8[np.ndarray, "h w 3"] | None) -> None:
         """Show one of `count` photos, with a line about it; None: there is no picture of it yet."""
@@ -249,12 +233,12 @@ def _status_card(now: Status, *remarks: str) -> str:
     """Return the status as HTML. Text from files is escaped: a photo's name must not become part of the page."""
     bar = ""
     if not now.is_over:
-        width = 100 * (now.fraction if now.fraction is not None else 0.0)
+        width = 100 * (now.share or 0.0)
         bar = (
             '<div style="height:6px;border-radius:3px;background:rgba(128,128,128,.25);margin:.5rem 0 .35rem">'
             f'<div style="height:6px;border-radius:3px;width:{width:.0f}%;background:rgb{BRAND}"></div></div>'
         )
-    facts = [now.counts, "" if now.is_over else left_text(now.eta_s)]
+    facts = [now.counts, "" if now.is_over else left_text(now.left_s)]
     facts.append(
         f"{duration_text(now.elapsed_s)} so far" if not now.is_over else f"took {duration_text(now.elapsed_s)}"
     )

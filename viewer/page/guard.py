@@ -34,7 +34,7 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from capture.errors import UserError
-from viewer.stage.files import HEADERS, HTML, StageFile, StageFiles
+from viewer.stage.files import HEADERS, HTML, SAFE_HEADERS, StageFile, StageFiles
 
 LARGEST = 1 << 16  # bytes of one message: decoded, it may need a hundred times its size
 VALUE = "GuiUpdateMessage"  # a control was moved or pressed
@@ -66,16 +66,13 @@ setTimeout(show, 8000);}
 COOKIE = "shadowgraph"
 LARGEST_FRAME = 1 << 21  # bytes of a message: twice a stage document, so that one too large gets a sentence
 FRAMES_WAITING = 4  # of one connection: received messages that are held before they are read
-OWN_HEADERS = {
+OWN_HEADERS = SAFE_HEADERS | {
     # nothing is loaded from elsewhere, and no other page may show this one in a frame (clickjacking)
     "Content-Security-Policy": (
         "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval'; connect-src 'self' data: blob:; "
         "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
     ),
     "X-Frame-Options": "DENY",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Resource-Policy": "same-origin",
 }
 
 

@@ -7,7 +7,6 @@ RateLimit says how often it may send what costs much, so that a run beside it ke
 
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -55,20 +54,14 @@ class RateLimit:
     threads do the sending, once to each visitor.
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic, spent: Callable[[], float] = time.process_time):
-        """Allow the first sending at once.
-
-        Args:
-            clock: seconds.
-            spent: CPU seconds of this process.
-        """
-        self._clock, self._spent = clock, spent
+    def __init__(self):
+        """Allow the first sending at once."""
         self._begun: tuple[float, float] | None = None  # clock and CPU seconds when the last sending began
         self._cost: float | None = None  # CPU seconds of the last sending; None: not asked since
 
     def begin(self) -> None:
         """Note that a sending begins."""
-        self._begun, self._cost = (self._clock(), self._spent()), None
+        self._begun, self._cost = (time.monotonic(), time.process_time()), None
 
     def is_due(self) -> bool:
         """Return whether another sending may begin."""
@@ -76,8 +69,8 @@ class RateLimit:
             return True
         start, before = self._begun
         if self._cost is None:
-            self._cost = self._spent() - before
-        return self._clock() - start >= max(MIN_INTERVAL_S, COST_FACTOR * self._cost)
+            self._cost = time.process_time() - before
+        return time.monotonic() - start >= max(MIN_INTERVAL_S, COST_FACTOR * self._cost)
 
 
 class Page:

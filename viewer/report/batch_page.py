@@ -1,7 +1,5 @@
 """index.html of a batch: one row per capture, with a picture, its state and remarks. A click on a heading sorts."""
 
-import base64
-import hashlib
 import html
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,7 +17,7 @@ from reconstruct.stored_run.stored_run import CALIBRATION, MESH
 from viewer.display.run_follower import size_text
 from viewer.report import document as doc
 from viewer.report.drawing import mesh_picture
-from viewer.report.pictures import view_from_camera
+from viewer.report.pictures import guessed_share, view_from_camera
 
 INDEX, THUMBNAIL = "index.html", "thumbnail.png"
 THUMBNAIL_PX = (160, 120)
@@ -58,7 +56,7 @@ def write_batch_page(folder: Path, tasks: Sequence[Task], outcomes: Mapping[str,
     )
     path = folder / INDEX
     with atomic_file(path) as temporary:
-        temporary.write_text(_document(f"Shadowgraph: {folder.resolve().name}", body), encoding="utf-8")
+        temporary.write_text(doc.page(f"Shadowgraph: {folder.resolve().name}", body, STYLE, SORT), encoding="utf-8")
     return path
 
 
@@ -71,19 +69,12 @@ def write_thumbnail(run_dir: Path) -> None:
             Image.fromarray(mesh_picture(mesh, back, THUMBNAIL_PX)).save(temporary, "PNG")
 
 
-def _document(title: str, body: str) -> str:
-    """The page, allowed its own pictures and its one script, by the script's hash."""
-    digest = base64.b64encode(hashlib.sha256(SORT.encode()).digest()).decode()
-    policy = f"default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
-    return doc.page(title, body, STYLE, policy).replace("</main>", f"</main><script>{SORT}</script>")
-
-
 def _row(folder: Path, task: Task, outcome: Outcome | None) -> str:
     """One capture: its cells, each with the key that it is sorted by."""
     state, kind, order = _state(outcome)
     size, extent = _size(outcome)
     used, total = _photos(outcome)
-    guess = _guess(outcome)
+    guess = guessed_share(outcome.report) if outcome else None
     picture = ""
     if is_regular(folder / task.name / THUMBNAIL):
         picture = f'<img src="{html.escape(task.name)}/{THUMBNAIL}" alt="">'
@@ -137,9 +128,3 @@ def _size(outcome: Outcome | None) -> tuple[str, float]:
 def _photos(outcome: Outcome | None) -> tuple[int, int]:
     photos = [p for p in (outcome.report.get("photos", []) if outcome else []) if p.get("role") == "lit"]
     return sum(bool(p.get("used")) for p in photos), len(photos)
-
-
-def _guess(outcome: Outcome | None) -> float | None:
-    """The share of the surface that nothing holds."""
-    kinds = outcome.report.get("mesh", {}).get("evidence", {}) if outcome else {}
-    return kinds["unconstrained"]["share"] if "unconstrained" in kinds else None

@@ -3,9 +3,9 @@
 import html
 from collections.abc import Sequence
 
+from viewer.display.embedded import hash_of
 from viewer.report.drawing import Picture, data_uri
 
-POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # the page may load nothing
 STYLE = """
 :root{--bg:#fbfaf8;--card:#fff;--text:#1d2026;--muted:#667080;--line:#dfe1e6;--accent:#d9820f;--good:#1f8a53;--bad:#c8402f}
 @media (prefers-color-scheme:dark){:root{--bg:#15171b;--card:#1d2026;--text:#e8eaee;--muted:#98a1b0;--line:#353a44;
@@ -48,18 +48,22 @@ table.words th{display:none}table.words td{display:block;padding:0;border:0}tabl
 """
 
 
-def page(title: str, body: str, style: str = "", policy: str = POLICY) -> str:
+def page(title: str, body: str, style: str = "", script: str = "") -> str:
     """Return a whole document. It loads nothing, and its policy forbids the browser to load anything.
 
     Args:
         style: more rules, after those of every page.
-        policy: what else it may load.
+        script: the only one that it may run; such a page may also show pictures that lie beside it.
     """
+    policy, code = "default-src 'none'; style-src 'unsafe-inline'; img-src data:", ""
+    if script:
+        policy, code = f"{policy} 'self'; script-src {hash_of(script)}", f"<script>{script}</script>"
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
-        f"<title>{html.escape(title)}</title><style>{STYLE}{style}</style></head><body><main>{body}</main></body></html>\n"
+        f"<title>{html.escape(title)}</title><style>{STYLE}{style}</style></head><body><main>{body}</main>{code}</body>"
+        "</html>\n"
     )
 
 

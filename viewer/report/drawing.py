@@ -1,6 +1,5 @@
 """Small 8-bit sRGB pictures: of photos, of depth and normals, and of a mesh, drawn without a graphics card."""
 
-import base64
 import io
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
 from capture.photos.photo import decode_srgb, encode_srgb
+from viewer.display.embedded import as_address, jpeg
 
 if TYPE_CHECKING:  # beside a run a page shows photos only, and opens sooner without it
     import trimesh
@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # beside a run a page shows photos only, and opens sooner wit
 Picture = UInt8[np.ndarray, "height width channels"]  # RGB, or RGBA where it has no background
 
 JPEG_QUALITY = 86
+MARGIN = 1.04  # of a picture's sides over a mesh that just fits in
 OVERSAMPLING = 2  # a mesh is drawn this much larger, then averaged: smooth outlines
 SAMPLES_PER_PIXEL = 1.6  # along a triangle's longest edge, so that no pixel of it is missed
 LARGEST_BATCH = 2_000_000  # surface samples drawn at a time: about 200 MB
@@ -32,12 +33,11 @@ STRONG_DIFFERENCE = 0.2  # of full sRGB scale: shown as full colour
 
 def data_uri(picture: Picture) -> str:
     """Return the picture as a data: address for an <img>: JPEG, or PNG if it has no background."""
+    if picture.shape[-1] == 3:
+        return as_address(jpeg(picture, JPEG_QUALITY), "image/jpeg")
     out = io.BytesIO()
-    if picture.shape[-1] == 4:
-        Image.fromarray(picture).save(out, "PNG")
-        return f"data:image/png;base64,{base64.b64encode(out.getvalue()).decode()}"
-    Image.fromarray(picture).save(out, "JPEG", quality=JPEG_QUALITY)
-    return f"data:image/jpeg;base64,{base64.b64encode(out.getvalue()).decode()}"
+    Image.fromarray(picture).save(out, "PNG")
+    return as_address(out.getvalue(), "image/png")
 
 
 def reduced(picture: Picture, width: int) -> Picture:
@@ -95,15 +95,12 @@ def vertex_colours(mesh: "trimesh.Trimesh") -> UInt8[np.ndarray, "n 3"]:
     return np.tile(np.array(PLAIN, np.uint8), (len(mesh.vertices), 1))
 
 
-def mesh_picture(
-    mesh: "trimesh.Trimesh", back: Float[np.ndarray, "3"], size: tuple[int, int], reach: float | None = None
-) -> Picture:
-    """Draw a mesh in its vertex colours by orthographic projection, RGBA with a transparent background.
+def mesh_picture(mesh: "trimesh.Trimesh", back: Float[np.ndarray, "3"], size: tuple[int, int]) -> Picture:
+    """Draw a mesh in its vertex colours by orthographic projection, RGBA with a transparent background; it fits in.
 
     Args:
         back: world direction from the mesh to the viewer, not straight up.
         size: width and height, px.
-        reach: half the world length shown across the shorter side; None = the mesh fits in.
     """
     width, height = size[0] * OVERSAMPLING, size[1] * OVERSAMPLING
     back = back / np.linalg.norm(back)
@@ -112,9 +109,8 @@ def mesh_picture(
     axes = np.stack([right, -np.cross(back, right), -back])  # picture right, picture down, away
     middle = mesh.bounds.mean(0)
     seen = (mesh.vertices - middle) @ axes.T
-    if reach is None:
-        reach = float(max(np.abs(seen[:, 0]).max() * min(1, height / width), np.abs(seen[:, 1]).max())) * 1.04
-    pixels = seen * (0.5 * min(width, height) / reach) + [width / 2, height / 2, 0]
+    scale = min(width / np.abs(seen[:, 0]).max(), height / np.abs(seen[:, 1]).max()) / (2 * MARGIN)
+    pixels = seen * scale + [width / 2, height / 2, 0]
     colours = _vertex_light(mesh, axes)
     depth = np.full(width * height, np.inf, np.float32)
     picture = np.zeros((width * height, 4), np.float32)

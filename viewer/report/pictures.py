@@ -1,12 +1,12 @@
 """The parts of the report that are pictures: mesh, maps, comparison, photos. Each is "" without its input.
 
-Comparison: a photo of a finished run, its computed picture and their difference.
+Comparison: a photo of a finished run, and its computed picture.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -15,12 +15,10 @@ from jaxtyping import Float
 from calibration.board.board_scale import scale_parts
 from calibration.calibration import Calibration
 from capture.photos.photo import decode_srgb, encode_srgb
-from reconstruct.detail.file import Detail
-from reconstruct.detail.fit import with_detail
 from reconstruct.fields import SolvedScene
-from reconstruct.render.g_buffer import RenderView, look
+from reconstruct.render.g_buffer import look
 from reconstruct.render.relight import photographed, shadow_picture, with_refined_lights
-from reconstruct.stored_run.maps import thumbnail_name
+from reconstruct.stored_run.maps import Maps, thumbnail_name
 from viewer.display.run_follower import size_text
 from viewer.report import document as doc
 from viewer.report.drawing import Picture, depth_picture, difference_picture, mesh_picture, normal_picture, reduced
@@ -33,71 +31,23 @@ MAP_WIDTH = 520  # px
 ELEVATION = 0.45  # rise of the mesh pictures' view per unit of distance
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Three pictures of one size, 8-bit sRGB."""
-
-    photo: Picture
-    computed: Picture
-    difference: Picture  # see difference_picture
-
-
-def compare(photo: Picture, linear: Float[np.ndarray, "height width 3"]) -> Comparison | None:
-    """Compare a photo with a computed picture, scaled to the photo's brightness; None if their sizes differ."""
-    if linear.shape != photo.shape:
-        return None
-    computed = as_bright_as(linear, photo)
-    return Comparison(photo, computed, difference_picture(photo, computed))
-
-
-def as_bright_as(linear: Float[np.ndarray, "height width 3"], photo: Picture) -> Picture:
-    """Scale a computed picture so that the median ratio of its pixels to the photo's is 1. sRGB."""
-    theirs = decode_srgb(photo)
-    both = (linear > BRIGHT_ENOUGH) & (theirs > BRIGHT_ENOUGH)
-    gain = float(np.median(theirs[both] / linear[both])) if both.any() else 1.0
-    return encode_srgb(gain * linear)
-
-
-def compare_result(
-    fields: SolvedScene, calibration: Calibration, name: str, photo: Picture, details: Sequence[Detail] = ()
-) -> Comparison | None:
-    """Compare a photo of a finished run, by its name in the calibration, with its computed picture."""
-    camera = fields.camera.resized(photo.shape[1], photo.shape[0])
-    view = with_detail(look(fields, posed_camera=replace(fields.posed_camera, camera=camera)), details, camera)
-    return compare(photo, _computed(view, with_refined_lights(calibration, fields), name, photo))
-
-
 def is_shadow_picture(photo: Picture) -> bool:
     """Return whether a picture is black and white: then it shows where light arrives, and nothing else."""
     grey = photo.mean(-1)
     return bool(np.mean((grey < BLACK_OR_WHITE) | (grey > 255 - BLACK_OR_WHITE)) > MOSTLY)
 
 
-def _computed(
-    view: RenderView, calibration: Calibration, name: str, photo: Picture
-) -> Float[np.ndarray, "height width 3"]:
-    """Return the linear picture that the photo should show; for a shadow picture, where light arrives."""
-    picture = shadow_picture if is_shadow_picture(photo) else photographed
-    return picture(view, calibration, name).numpy()
+def computed_picture(fields: SolvedScene, calibration: Calibration, name: str, photo: Picture) -> Picture:
+    """Return the picture that a photo of a finished run, by its name in the calibration, should show. sRGB.
 
-
-class HasMaps(Protocol):
-    """Depth, normals and mask on the grid of the photos."""
-
-    @property
-    def depth(self) -> np.ndarray:
-        """Z-depth, world length; inf where the object is not seen."""
-        ...
-
-    @property
-    def normals(self) -> np.ndarray:
-        """Unit outward normals, world; 0 where the object is not seen."""
-        ...
-
-    @property
-    def mask(self) -> np.ndarray:
-        """True where the object is seen."""
-        ...
+    Its brightness is the photo's: the median ratio of their pixels is 1. Of a shadow picture it is where light arrives.
+    """
+    camera = fields.camera.resized(photo.shape[1], photo.shape[0])
+    view = look(fields, posed_camera=replace(fields.posed_camera, camera=camera))
+    draw = shadow_picture if is_shadow_picture(photo) else photographed
+    linear, theirs = draw(view, with_refined_lights(calibration, fields), name).numpy(), decode_srgb(photo)
+    both = (linear > BRIGHT_ENOUGH) & (theirs > BRIGHT_ENOUGH)
+    return encode_srgb((float(np.median(theirs[both] / linear[both])) if both.any() else 1.0) * linear)
 
 
 def size_facts(mesh: trimesh.Trimesh, calibration: Calibration | None) -> list[tuple[str, str]]:
@@ -185,7 +135,7 @@ def _known_from(mesh: trimesh.Trimesh, way: Float[np.ndarray, "3"]) -> str:
     return f": {seen:.0%} seen in the photos, {shadow:.0%} held by shadows"
 
 
-def maps_part(maps: HasMaps | None, calibration: Calibration | None) -> str:
+def maps_part(maps: Maps | None, calibration: Calibration | None) -> str:
     """Return the part about depth and normals as the camera sees them."""
     if maps is None or not maps.mask.any():
         return ""
@@ -217,16 +167,14 @@ def comparison_part(fields: SolvedScene | None, calibration: Calibration | None,
         return ""
     light = lights[len(lights) // 2]
     photo = reduced(thumbs[Path(light.photo).stem], MAP_WIDTH)
-    found = compare_result(fields, calibration, light.photo, photo)
-    if found is None:
-        return ""
+    computed = computed_picture(fields, calibration, light.photo, photo)
     return doc.section(
         "Does the surface explain the photos?",
         "If the surface, its colours and the light are right, a computed picture looks like the photo.",
         doc.row(
             doc.figure(photo, f"Photo {light.photo}"),
-            doc.figure(found.computed, "Computed from the surface found, at the photo's overall brightness"),
-            doc.figure(found.difference, "Difference: red, the photo is brighter; blue, darker"),
+            doc.figure(computed, "Computed from the surface found, at the photo's overall brightness"),
+            doc.figure(difference_picture(photo, computed), "Difference: red, the photo is brighter; blue, darker"),
         ),
     )
 

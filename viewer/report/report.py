@@ -17,11 +17,10 @@ import trimesh
 from calibration.calibration import Calibration, load_calibration
 from capture.errors import UserError
 from capture.files.atomic import atomic_file
-from capture.files.regular import is_own_folder
 from reconstruct.fields import SolvedScene
 from reconstruct.source.source import RunOptions
 from reconstruct.stored_run.documents import MANIFEST, REPORT
-from reconstruct.stored_run.maps import DEPTH, THUMBS, Maps, read_maps, read_thumbnails
+from reconstruct.stored_run.maps import DEPTH, Maps, read_maps, read_thumbnails
 from reconstruct.stored_run.ply import read_mesh
 from reconstruct.stored_run.stored_run import CALIBRATION, FIELDS, MESH, StoredRun
 from viewer.display.run_follower import RunFollower, status
@@ -84,11 +83,12 @@ def read_results(run_dir: Path) -> Results:
         report = report | {"stages": attempt(MANIFEST, lambda: run.manifest, {}).get("costs", {})}
     calibration = attempt(CALIBRATION, lambda: load_calibration(run_dir / CALIBRATION), None)
     size = None if calibration is None else (calibration.camera.height, calibration.camera.width)
-    thumbs = read_thumbnails(run_dir, _names_of_thumbs(run_dir))
+    follower = RunFollower(run_dir)
+    thumbs = read_thumbnails(run_dir, follower.thumbnails())
     return Results(
         name=run.name,
         report=report,
-        log=RunFollower(run_dir).log(),
+        log=follower.log(),
         calibration=calibration,
         mesh=attempt(MESH, lambda: read_mesh(run_dir / MESH), None),
         fields=None if calibration is None else attempt(FIELDS, lambda: _fields_of(run), None),
@@ -96,11 +96,6 @@ def read_results(run_dir: Path) -> Results:
         thumbs={Path(name).stem: picture for name, picture in thumbs.items()},
         problems=problems,
     )
-
-
-def _names_of_thumbs(run_dir: Path) -> list[str]:
-    folder = run_dir / THUMBS
-    return sorted(path.name for path in folder.glob("*.jpg")) if is_own_folder(folder) else []
 
 
 def _fields_of(run: StoredRun) -> SolvedScene:

@@ -18,11 +18,13 @@ SHARED = "share.html"  # the page in one file, to send
 SAVE = "save/"  # and the name of a format: the run as a file of that kind
 HTML, ZIP = "text/html; charset=utf-8", "application/zip"
 LARGEST_SAVED = 1 << 30  # bytes
-HEADERS = {
+SAFE_HEADERS = {  # of every answer of a server of ours
     "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "SAMEORIGIN",  # a page of the same server may show it in a frame
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
+}
+HEADERS = SAFE_HEADERS | {  # a page of the same server may show the stage in a frame
+    "X-Frame-Options": "SAMEORIGIN",
     "Cache-Control": "no-cache",
 }
 

@@ -1,14 +1,11 @@
 """The scene's numbers as one packed block: what the page's scene.js unpacks."""
 
-import base64
 import gzip
-import io
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
-from PIL import Image
 
 from reconstruct.export.stage_scene import StageScene
 
@@ -72,19 +69,6 @@ def unpacked_corners(block: bytes, parts: dict[str, dict[str, Any]]) -> Shaped[n
     planes = raw[start : start + 4 * count].reshape(4, count).astype(np.int64)
     zigzag = planes[0] << 24 | planes[1] << 16 | planes[2] << 8 | planes[3]
     return np.cumsum(np.where(zigzag & 1, -(zigzag + 1) // 2, zigzag // 2))
-
-
-def jpeg(picture: UInt8[np.ndarray, "height width 3"], quality: int, is_exact: bool = False) -> bytes:
-    """Return a picture as JPEG; with `is_exact` its colours are kept at full resolution, as those of normals."""
-    file = io.BytesIO()
-    subsampling = 0 if is_exact else 2
-    Image.fromarray(picture).save(file, format="JPEG", quality=quality, subsampling=subsampling)
-    return file.getvalue()
-
-
-def as_address(content: bytes, kind: str) -> str:
-    """Return a file as a data address."""
-    return f"data:{kind};base64," + base64.b64encode(content).decode()
 
 
 def _share(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:

@@ -1,7 +1,6 @@
 """The stage as a page: in one file with all its parts, or as a page that asks for its parts beside it."""
 
 import base64
-import hashlib
 import html
 import json
 import re
@@ -18,7 +17,8 @@ from reconstruct.export.formats import FORMATS
 from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
 from reconstruct.stored_run.stage_pack import StagePack, addressed
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.stage.pack import as_address, unpacked_corners
+from viewer.display.embedded import as_address, hash_of
+from viewer.stage.pack import unpacked_corners
 from viewer.stage.pack_file import kind_of, stage_pack
 
 SCRIPTS = (
@@ -37,7 +37,6 @@ SCRIPTS = (
     "panel",
     "main",
 )
-BACKGROUND = "24, 26, 31"  # sRGB, as of the pictures
 SHADERS = ("surface.vert", "surface.frag", "depth.frag", "full.vert", "light.frag", "blur.frag", "show.frag")
 SHADERS += ("lines.vert", "lines.frag")
 READ_ERRORS = (OSError, ValueError, LookupError, TypeError, EOFError)
@@ -75,18 +74,19 @@ def page_html(
     is_served = saves == "socket"
     addresses = {part: part if is_served else as_address(pack.read(part), kind_of(part)) for part in pack.names}
     facts = addressed(pack.facts, addresses)
-    script, style = script_text(), _asset("stage.css").replace("{{background}}", BACKGROUND)
     values = {
         "title": html.escape(name),
         "size": html.escape(str(facts["size"])),
         "policy": page_policy(is_served),
-        "style": style,
+        "style": _asset("stage.css"),
         "first": html.escape(facts["addresses"]["first"]),
         "scene": _json({**facts, "name": name}),
         "document": _json(document or EMPTY),
         "served": _json({"saves": saves, "home": home, **({"formats": _file_kinds()} if is_served else {})}),
-        "shaders": "\n".join(f'<script type="text/plain" id="{name}">{_shader(name)}</script>' for name in SHADERS),
-        "script": script,
+        "shaders": "\n".join(
+            f'<script type="text/plain" id="{shader}">{_asset(f"{shader}.glsl")}</script>' for shader in SHADERS
+        ).replace("//#photo", _asset("photo.glsl")),
+        "script": script_text(),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda found: values[found.group(1)], _asset("stage.html"))
 
@@ -99,11 +99,10 @@ def _file_kinds() -> dict[str, tuple[str, str]]:
 
 def page_policy(is_served: bool) -> str:
     """Return the page's content security policy: its own script and style, and nothing from elsewhere."""
-    style = _asset("stage.css").replace("{{background}}", BACKGROUND)
     own, connects = ("'self' ", "'self'") if is_served else ("", "'none'")
     return (
-        f"default-src 'none'; script-src {_hash(script_text())}; style-src {_hash(style)}; img-src {own}data: blob:; "
-        f"connect-src {connects}; base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; script-src {hash_of(script_text())}; style-src {hash_of(_asset('stage.css'))}; "
+        f"img-src {own}data: blob:; connect-src {connects}; base-uri 'none'; form-action 'none'"
     )
 
 
@@ -143,18 +142,9 @@ def read(run: StoredRun, path: Path) -> Contents:
     return Contents(len(corners) // 3, (x, y, z), note=note)
 
 
-def _shader(name: str) -> str:
-    return _asset(f"{name}.glsl").replace("//#photo", _asset("photo.glsl"))
-
-
 def _json(value: Any) -> str:
     """Return JSON that ends no script element."""
     return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-
-
-def _hash(text: str) -> str:
-    digest = hashlib.sha256(text.encode()).digest()
-    return f"'sha256-{base64.b64encode(digest).decode()}'"
 
 
 def _asset(name: str) -> str:

@@ -15,8 +15,9 @@ from reconstruct.render.studio import Studio, studio_of
 from reconstruct.stored_run.maps import read_thumbnail
 from reconstruct.stored_run.stage_pack import stage_archive
 from reconstruct.stored_run.stored_run import StoredRun
+from viewer.display.embedded import jpeg
 from viewer.stage.facts import BACKGROUND, first_window, home_pose, lit_photos, stage_facts
-from viewer.stage.pack import Block, jpeg, packed
+from viewer.stage.pack import Block, packed
 
 QUALITY, NORMAL_QUALITY, PHOTO_QUALITY = 90, 95, 82  # JPEG
 TILE = 512  # px

@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from calibration.board.board import parse_board, parse_print
-from calibration.board.printing import DEFAULT_BOARDS, PAPERS, BoardPage, draw_pdf, lay_out
+from calibration.board.printing import DEFAULT_BOARDS, PAPERS, BoardPage, lay_out
 from capture.errors import CaptureError
 
 CHOICES = (
@@ -43,19 +43,9 @@ def board_page(spec: str, paper: str) -> BoardPage:
     return lay_out(parse_print(spec or DEFAULT_BOARDS["charuco"]), paper)
 
 
-def board_pdf(spec: str, paper: str) -> bytes:
-    """Return the page to print."""
-    return draw_pdf(board_page(spec, paper))
-
-
 def board_shapes(spec: str) -> dict[str, Any]:
     """Return the board's rectangles in mm from the upper left corner of its sheet, with the sheet's size, to draw."""
     page = board_page(spec, "a4")
     upright = [replace(shape, y=page.height_mm - shape.y - shape.height) for shape in page.rectangles]
     rows = [[shape.x, shape.y, shape.width, shape.height, int(shape.is_black)] for shape in upright]
-    return {
-        "width": page.width_mm,
-        "height": page.height_mm,
-        "shapes": rows,
-        "spec": page.board.spec(),
-    }
+    return {"width": page.width_mm, "height": page.height_mm, "shapes": rows, "spec": page.board.spec()}

@@ -7,6 +7,7 @@ import contextlib
 import hashlib
 import subprocess
 import time
+from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +17,7 @@ from capture.errors import UserError
 from capture.files.atomic import write_json
 from capture.session.session import FEWEST_LIT
 from capture.session.skipped import clips_of, photos_of
-from reconstruct.run.batch import PROGRAM, start_command, why_it_failed
+from reconstruct.run.batch import start_command, why_it_failed
 from reconstruct.stored_run.documents import CHECK, read_check
 from viewer.studio.helper import Helper
 from viewer.studio.words import without_folder
@@ -43,9 +44,9 @@ class _Watched:
 class Checks:
     """First looks and verdicts of the captures of a studio."""
 
-    def __init__(self, folder: Path, helper: Helper):
-        """Keep verdicts in `folder`."""
-        self._folder, self._helper = folder, helper
+    def __init__(self, folder: Path, helper: Helper, program: Sequence[str]):
+        """Keep verdicts in `folder`; `program` is the command `shadowgraph`."""
+        self._folder, self._helper, self._program = folder, helper, program
         self._watched: dict[Path, _Watched] = {}
         self._process: tuple[Path, str, subprocess.Popen[bytes]] | None = None
 
@@ -123,7 +124,7 @@ class Checks:
     def _start(self, capture: Path, mark: str) -> None:
         place = self._place(capture)
         place.mkdir(parents=True, exist_ok=True)
-        words = [*PROGRAM, "check", str(capture), "--out", str(place)]
+        words = [*self._program, "check", str(capture), "--out", str(place)]
         self._process = (capture, mark, start_command(words, place / LOG, for_studio=True))
 
     def _note_end(self) -> None:

@@ -10,13 +10,11 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from msgspec import Struct
-
 from capture.errors import CaptureError, UserError
-from capture.files.atomic import read_json, write_json
+from capture.files.atomic import write_json
 from capture.files.names import is_shown
 from capture.files.regular import is_own_folder
-from capture.files.schema import Count, FileName, Number, Text, as_type
+from capture.files.schema import Count, FileName, Number, Text, read_kept
 from capture.files.title import as_name, keep_title
 from reconstruct.run.batch import looks_like_capture
 from reconstruct.run_folder.folder import LOG
@@ -31,14 +29,6 @@ MOST_LOOKED_INTO = 50  # folders, to find out whether a folder is one for a stud
 MOST_FOLDERS = 2_000  # that are looked at
 DEEPEST = 4  # levels below the folder at which a person may choose one
 NOTE = "note.json"
-
-
-class _Address(Struct):
-    address: Text
-
-
-class _Token(Struct):
-    token: Text
 
 
 class StudioFolder:
@@ -89,10 +79,7 @@ class StudioFolder:
         """Return the address of the studio that has this folder; None where none has it."""
         if lock_holder(self.kept / LOCK) is None:
             return None
-        try:
-            return as_type(read_json(self.kept / ADDRESS), _Address, ADDRESS).address
-        except (OSError, ValueError, UserError):
-            return None
+        return (read_kept(self.kept / ADDRESS, dict) or {}).get("address")
 
     def note_address(self, address: str) -> None:
         """Keep the address for a second studio that is started by mistake; only this user can read it."""
@@ -101,14 +88,10 @@ class StudioFolder:
     def token(self) -> str:
         """Return the secret of the address; it stays the same, so that an open page survives a restart."""
         path = self.kept / "token.json"
-        try:
-            token = as_type(read_json(path), _Token, str(path)).token
-            if len(token) >= TOKEN_BYTES:
-                return token
-        except (OSError, ValueError, UserError):
-            pass
-        token = secrets.token_urlsafe(TOKEN_BYTES)
-        write_json(path, {"token": token})
+        token = str((read_kept(path, dict) or {}).get("token", ""))
+        if len(token) < TOKEN_BYTES:
+            token = secrets.token_urlsafe(TOKEN_BYTES)
+            write_json(path, {"token": token})
         return token
 
     # --- what is there -----------------------------------------------------------------------------------------------
@@ -215,11 +198,7 @@ class StudioFolder:
         return [path for key in keys if (path := self.root / key).is_dir() and path.resolve().is_relative_to(self.root)]
 
     def _keys_added(self) -> list[str]:
-        try:
-            found = read_json(self.kept / ADDED)
-            return [key for key in found if isinstance(key, str)] if isinstance(found, list) else []
-        except (OSError, ValueError, UserError):
-            return []
+        return [key for key in read_kept(self.kept / ADDED, list) or [] if isinstance(key, str)]
 
     def _folders(self, place: Path) -> list[Path]:
         """Return the folders in a place that are not hidden and do not lead outside, at most MOST_FOLDERS."""
@@ -291,7 +270,7 @@ class Trash:
 
     def list(self) -> list[Deleted]:
         """Return what is in it, the newest first."""
-        found = [_read(place / NOTE) for place in self._folder.iterdir() if place.is_dir()]
+        found = [read_kept(place / NOTE, Deleted) for place in self._folder.iterdir() if place.is_dir()]
         return sorted((one for one in found if one is not None), key=lambda one: -one.when)
 
     def restore(self, id_: str) -> str:
@@ -317,10 +296,3 @@ class Trash:
         for place in self._folder.iterdir():
             shutil.rmtree(place, ignore_errors=True)
         return freed
-
-
-def _read(path: Path) -> Deleted | None:
-    try:
-        return as_type(read_json(path), Deleted, str(path))
-    except (OSError, ValueError, UserError):
-        return None

@@ -29,54 +29,54 @@ GONE = "the helper process ended before it had answered; often the system ends i
 CANCELLED = "Cancelled."
 
 
+class Task(Future[Any]):
+    """A request, as a line of JSON, and its answer to come: a JSON value, or a CaptureError."""
+
+    def __init__(self, request: str):
+        """Nothing is known of it yet."""
+        super().__init__()
+        self.request = request
+        self.share: float | None = None  # that is done; None while it waits, or where it does not say
+
+
 class Helper:
     """One process and the tasks that wait for it, in order; the same task is done once at a time."""
 
-    def __init__(self, log: Path, program: tuple[str, ...] = PROGRAM):
+    def __init__(self, log: Path):
         """Start nothing yet; what the process says on stderr goes into `log`."""
-        self._log, self._program = log, program
-        self._waiting: OrderedDict[str, tuple[dict[str, Any], Future[Any]]] = OrderedDict()
+        self._log = log
+        self._waiting: OrderedDict[str, Task] = OrderedDict()  # by their requests
         self._changed = threading.Condition()
         self._process: subprocess.Popen[bytes] | None = None
-        self._at_hand: Future[Any] | None = None
-        self._shares: dict[Future[Any], float] = {}  # of tasks that have said how far they are
+        self._at_hand: Task | None = None
         self._is_closed = False
         self._thread = threading.Thread(target=self._work, name="helper", daemon=True)
         self._thread.start()
 
-    def ask(self, task: str, is_urgent: bool = False, **arguments: Any) -> "Future[Any]":
-        """Return the future answer of a task: a JSON value, or a CaptureError.
+    def ask(self, task: str, is_urgent: bool = False, **arguments: Any) -> Task:
+        """Return a task by its name and arguments: that which waits already, or a new one.
 
         Args:
-            is_urgent: before all others that wait.
+            is_urgent: a new one comes before all others that wait.
         """
-        request = {"task": task, "arguments": arguments}
-        name = json.dumps(request, sort_keys=True)
+        new = Task(json.dumps({"task": task, "arguments": arguments}, sort_keys=True))
         with self._changed:
-            if name in self._waiting:
-                return self._waiting[name][1]
-            future: Future[Any] = Future()
-            self._waiting[name] = (request, future)
-            if is_urgent:
-                self._waiting.move_to_end(name, last=False)
+            found = self._waiting.setdefault(new.request, new)
+            if found is new and is_urgent:
+                self._waiting.move_to_end(new.request, last=False)
             self._changed.notify()
-        return future
+        return found
 
-    def share(self, future: "Future[Any]") -> float | None:
-        """Return which share of a task is done; None while it waits, or where it does not say."""
-        return self._shares.get(future)
-
-    def cancel(self, future: "Future[Any]") -> None:
+    def cancel(self, task: Task) -> None:
         """Let a task fail with CANCELLED, and end the process if it is at it; nothing where the task is done."""
         with self._changed:
-            names = [name for name, (_, waiting) in self._waiting.items() if waiting is future]
-            for name in names:
-                self._waiting.pop(name)
-            is_at_hand = future is self._at_hand
+            is_waiting, is_at_hand = self._is_wanted(task), task is self._at_hand
+            if is_waiting:
+                self._waiting.pop(task.request)
             if is_at_hand and self._process is not None:
                 self._process.kill()  # the thread that waits for its answer does the rest
-        if names and not is_at_hand:
-            future.set_exception(CaptureError(CANCELLED))
+        if is_waiting and not is_at_hand:
+            task.set_exception(CaptureError(CANCELLED))
 
     def close(self) -> None:
         """End the process; tasks that wait fail."""
@@ -85,6 +85,9 @@ class Helper:
             self._changed.notify()
         self._end()
 
+    def _is_wanted(self, task: Task) -> bool:
+        return self._waiting.get(task.request) is task
+
     def _work(self) -> None:
         while not self._is_closed:
             with self._changed:
@@ -92,35 +95,33 @@ class Helper:
                     self._end()
                 if not self._waiting:
                     continue
-                name, (request, future) = next(iter(self._waiting.items()))
-                self._at_hand = future
+                task = self._at_hand = next(iter(self._waiting.values()))
             try:
-                answer = self._exchange(request, future)
+                answer = self._exchange(task)
             except (OSError, ValueError):
                 answer = {"error": GONE}
             with self._changed:
                 self._at_hand = None
-                is_wanted = self._waiting.get(name, (request, None))[1] is future
+                is_wanted = self._is_wanted(task)
                 if is_wanted:
-                    self._waiting.pop(name)
-                self._shares.pop(future, None)
+                    self._waiting.pop(task.request)
             if answer.get("error") == GONE or not is_wanted:  # it may have been killed just after its answer
                 self._end()
             if not is_wanted:
                 answer = {"error": CANCELLED}
             if "error" in answer:
-                future.set_exception(CaptureError(str(answer["error"])[:1000]))
+                task.set_exception(CaptureError(str(answer["error"])[:1000]))
             else:
-                future.set_result(answer.get("answer"))
+                task.set_result(answer.get("answer"))
 
-    def _exchange(self, request: dict[str, Any], future: "Future[Any]") -> dict[str, Any]:
+    def _exchange(self, task: Task) -> dict[str, Any]:
         with self._changed:
-            if all(waiting is not future for _, waiting in self._waiting.values()):
+            if not self._is_wanted(task):
                 raise ValueError(CANCELLED)
             if self._process is None or self._process.poll() is not None:
-                self._process = start_command(self._program, self._log, speaks=True)
+                self._process = start_command(PROGRAM, self._log, speaks=True)
         assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.write(json.dumps(request).encode() + b"\n")
+        self._process.stdin.write(task.request.encode() + b"\n")
         self._process.stdin.flush()
         while True:
             line = self._process.stdout.readline(LONGEST_ANSWER)
@@ -129,7 +130,7 @@ class Helper:
                 raise ValueError("no answer")
             if "share" not in answer:
                 return answer
-            self._shares[future] = float(answer["share"])
+            task.share = float(answer["share"])
 
     def _end(self) -> None:
         process, self._process = self._process, None

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from capture.session.skipped import clips_of, folder_role, photos_of
 from reconstruct.run.queue import FAILED, FINISHED, RUNNING, STOPPED, WAITING, Job, Queue
 from reconstruct.run_folder.folder import LOG
 from reconstruct.stored_run.documents import CHECK, REPORT, read_check, read_manifest, read_report
-from viewer.display.run_follower import RunFollower, status
+from viewer.display.run_follower import RunFollower, Status, status
 from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder
 from viewer.studio.live_pages import mark_of
@@ -31,36 +31,6 @@ ROLES = {
     "dark": "without light",
     "side": "from the side",
 }
-
-
-@dataclass(frozen=True)
-class _Progress:
-    """Where a run is."""
-
-    title: str  # what is done now, in plain words
-    message: str
-    share: float  # of the whole run, 0 to 1
-    elapsed_s: float
-    left_s: float | None  # until its end; None: not known yet
-    is_running: bool
-    is_finished: bool
-
-
-def _progress(follower: RunFollower, since_last_line_s: float = 0.0, started_s: float | None = None) -> _Progress:
-    """Return where the run of a folder is.
-
-    Args:
-        since_last_line_s: seconds since the log's last line was written.
-        started_s: seconds since the queue started its process, which may not have taken the folder yet and whose log
-            counts from a little later; None: the queue runs no process in it.
-    """
-    lines, is_running = follower.log(), follower.is_running() or started_s is not None
-    now = status(lines, is_running, since_last_line_s)
-    if now.is_finished:
-        return _Progress(now.title, "", 1.0, now.elapsed_s, 0.0, False, True)
-    elapsed = max(now.elapsed_s, since_last_line_s if is_running else 0.0, started_s or 0.0)
-    title, message = (now.title, now.message) if lines else ("Starting" if is_running else now.title, "")
-    return _Progress(title, message, now.fraction or 0.0, elapsed, now.eta_s, is_running, False)
 
 
 class Library:
@@ -126,16 +96,18 @@ class Library:
     def run_row(self, key: str, path: Path, job: Job | None) -> dict[str, Any]:
         """Return what a card shows of one run."""
         follower = self._followers.setdefault(path, RunFollower(path))
-        changed = _time_of(path / LOG) or (job.asked if job else 0.0)
-        began = job.began if job is not None and job.state == RUNNING else None
-        last, clock = max(changed, began or 0.0), time.time()  # taken up again: not since its last line
-        now = _progress(follower, max(0.0, clock - last), None if began is None else max(0.0, clock - began))
+        changed = _time_of(path / LOG) or (job.asked if job else _time_of(path))
+        began = job.began if job is not None and job.state == RUNNING else None  # it may not have taken the folder yet
+        is_running, since = began is not None or follower.is_running(), time.time() - max(changed, began or 0.0)
+        now = status(follower.log(), is_running, max(0.0, since))
+        if began is not None:  # taken up again, its log counts from an earlier start
+            now = replace(now, elapsed_s=max(now.elapsed_s, time.time() - began))
         report = self._document(path / REPORT, read_report)
         manifest = self._document(path / "manifest.json", read_manifest)
         check = self._document(path / CHECK, read_check)
         preset = str((manifest.get("config") or {}).get("preset") or (job.preset if job else ""))
         mesh = report.get("mesh") or {}
-        state, sentence = _state(job, now.is_running, now.is_finished, now.title)
+        state, sentence = _state(job, is_running, now)
         if job is not None:
             sentence = without_folder(sentence, Path(job.task.capture), "this capture")
         return {
@@ -223,17 +195,17 @@ def _board_of(capture: Path) -> str:
         return ""
 
 
-def _state(job: Job | None, is_running: bool, is_finished: bool, title: str) -> tuple[str, str]:
+def _state(job: Job | None, is_running: bool, now: Status) -> tuple[str, str]:
     """Return a run's state and its sentence; what the folder shows counts more than what the queue remembers."""
     if job is not None and job.state == WAITING:
         return WAITING, "Waits for the run before it."
-    if is_running or (job is not None and job.state == RUNNING):
+    if (is_running and not now.is_finished) or (job is not None and job.state == RUNNING):
         return RUNNING, ""
-    if is_finished:
+    if now.is_finished:
         return FINISHED, ""
     if job is not None and job.state in (FAILED, STOPPED):
         return job.state, job.sentence or "Stopped. It goes on where it stood."
-    return STOPPED, f"{title}. It was started in a terminal. Started again there, it goes on where it stood."
+    return STOPPED, f"{now.title}. It was started in a terminal. Started again there, it goes on where it stood."
 
 
 def counts_of(photos: Sequence[Mapping[str, Any]], check: Mapping[str, Any]) -> dict[str, Any]:

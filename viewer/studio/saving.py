@@ -5,7 +5,6 @@ Videos take minutes: they have a process of their own, so that other files are m
 
 import contextlib
 import shutil
-from concurrent.futures import Future
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -16,7 +15,7 @@ from capture.files.regular import is_own_folder, is_regular
 from capture.files.title import TITLE, title_of
 from viewer.report.formats import FORMATS
 from viewer.studio.folder import StudioFolder
-from viewer.studio.helper import Helper
+from viewer.studio.helper import Helper, Task
 
 MADE_OF = ("mesh.ply", "fields.safetensors", "detail.safetensors", "stage.json", TITLE)  # what an export shows
 LONGEST_SIZE = 12  # letters of a number
@@ -24,13 +23,23 @@ LONGEST_SIZE = 12  # letters of a number
 
 @dataclass(frozen=True)
 class Asked:
-    """A file that somebody asked for: of which run, which kind and size, and the task that makes it."""
+    """A file that somebody asked for: of which run, which kind and size, and the task that makes it in a folder."""
 
     key: str
     name: str
     size: str
+    out: Path
     helper: Helper
-    future: Future[Any]
+    task: Task
+
+    def row(self) -> dict[str, Any] | None:
+        """Return what has become of it, as `Saving.ask` does, with `error`; None: it was removed with the trash."""
+        if not self.task.done():
+            return {"file": "", "about": "", "share": self.task.share, "error": ""}
+        if error := self.task.exception():
+            return {"file": "", "about": "", "share": None, "error": str(error)}
+        made = self.task.result()
+        return made | {"share": 1.0, "error": ""} if is_regular(self.out / made["file"]) else None
 
 
 class Saving:
@@ -81,44 +90,36 @@ class Saving:
 
     def asked(self, key: str) -> list[dict[str, Any]]:
         """Return the files asked for of a run as it is now: as `ask`, with `name`, `size`, `title` and `error`."""
-        rows = []
-        for out, one in list(self._asked.items()):
-            if one.key != key or self._request(key, one.name, one.size)[0] != out:
-                continue
-            error = one.future.exception() if one.future.done() else None
-            if one.future.done() and error is None and not is_regular(out / one.future.result()["file"]):
-                continue  # removed with the trash
-            found = _waiting(one) if error or not one.future.done() else one.future.result() | {"share": 1.0}
-            known = {"name": one.name, "size": one.size, "title": FORMATS[one.name].title}
-            rows.append(known | found | {"error": str(error or "")})
-        return rows
+        now = [one for one in list(self._asked.values()) if one.key == key]
+        now = [one for one in now if self._request(key, one.name, one.size)[0] == one.out]
+        known = [(row, one) for one in now if (row := one.row()) is not None]
+        return [row | {"name": one.name, "size": one.size, "title": FORMATS[one.name].title} for row, one in known]
 
     def forget(self, key: str, name: str, size: str) -> None:
         """Cancel a file that is being made, or remove one that was made."""
         out, _ = self._request(key, name, size)
         one = self._asked.pop(out, None)
         if one is not None:
-            one.helper.cancel(one.future)
-            one.future.add_done_callback(lambda _: shutil.rmtree(out, ignore_errors=True))
+            one.helper.cancel(one.task)
+            one.task.add_done_callback(lambda _: shutil.rmtree(out, ignore_errors=True))
 
     def _answer(self, key: str, name: str, size: str) -> tuple[Path, dict[str, Any]]:
         out, arguments = self._request(key, name, size)
-        one = self._asked.get(out)
-        if one is not None and one.future.done() and one.future.exception() is not None:
+        row = self._asked[out].row() if out in self._asked else None
+        if row is not None and row["error"]:
             self._asked.pop(out, None)  # asked anew, it is tried again
-            raise CaptureError(str(one.future.exception()))
-        if one is not None and one.future.done() and not is_regular(out / one.future.result()["file"]):
-            one = None  # removed with the trash
-        if one is None:
+            raise CaptureError(row["error"])
+        if row is None:
             helper = self._films if "frames" in FORMATS[name].takes else self._files
-            one = self._asked[out] = Asked(key, name, size, helper, helper.ask("save", **arguments))
-        return out, one.future.result() | {"share": 1.0} if one.future.done() else _waiting(one)
+            self._asked[out] = Asked(key, name, size, out, helper, helper.ask("save", **arguments))
+            row = {"file": "", "about": "", "share": None}
+        return out, row
 
     def clear(self) -> None:
         """Remove what was made; each can be made again."""
         if is_own_folder(self._place):
             for place in self._place.iterdir():
-                if all(one.future.done() for out, one in self._asked.items() if out == place):
+                if place not in self._asked or self._asked[place].task.done():
                     shutil.rmtree(place, ignore_errors=True)
 
     def _request(self, key: str, name: str, size: str) -> tuple[Path, dict[str, Any]]:
@@ -145,10 +146,6 @@ class Saving:
         if not is_regular(run / "mesh.ply"):
             raise CaptureError(f"{title_of(run)} has no result yet that could be saved.")
         return run
-
-
-def _waiting(one: Asked) -> dict[str, Any]:
-    return {"file": "", "about": "", "share": one.helper.share(one.future)}
 
 
 def _number(size: str) -> float | None:

@@ -4,7 +4,7 @@ import contextlib
 import shutil
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from dataclasses import asdict
@@ -40,6 +40,7 @@ MOST_MEASURED = 8  # captures whose predicted costs are kept
 MOST_STAGES = 4  # runs whose stages stay in memory: each takes a few megabytes
 PRESETS = ("draft", "standard", "fine")
 REPORT_PAGE = "report.html"
+ACTIONS = ("stop", "first", "again")  # of the queue
 
 
 class Studio:
@@ -57,7 +58,7 @@ class Studio:
         self.looks = Helper(folder.kept / "looks.txt")
         self.thumbnails = Helper(folder.kept / "thumbnails.txt")
         self.pictures = Helper(folder.kept / "pictures.txt")
-        self.checks = Checks(folder.kept / "checks", self.looks)
+        self.checks = Checks(folder.kept / "checks", self.looks, program)
         self.library = Library(folder, self.queue, self.parts, self.checks)
         self.trash = Trash(folder.root)
         self.pages = LivePages(folder)
@@ -87,12 +88,8 @@ class Studio:
         self._ended.set()
         for thread in self._threads:
             thread.join(LEAVING_S)
-        self.checks.close()
-        self.pages.close()
-        self.looks.close()
-        self.thumbnails.close()
-        self.pictures.close()
-        self.saving.close()
+        for part in (self.checks, self.pages, self.looks, self.thumbnails, self.pictures, self.saving):
+            part.close()
 
     # --- what is there -----------------------------------------------------------------------------------------------
 
@@ -161,7 +158,7 @@ class Studio:
             CaptureError: the capture has no such photo.
         """
         capture = self.folder.capture(key)
-        photos = {path.relative_to(capture).as_posix(): path for path in photos_of(capture)}
+        photos = _named(capture, photos_of(capture))
         if photo == "" and photos:
             photo = next(reversed(photos))
         if photo not in photos:
@@ -242,7 +239,7 @@ class Studio:
             path = self._find(key)
             if any(job.is_open and path in (job.run, Path(job.task.capture)) for job in self.queue.jobs):
                 raise CaptureError(f"{title_of(path)} runs or waits in the queue; stop that first.")
-            if key in self.folder.runs() and self.library.run_row(key, path, None)["progress"]["is_running"]:
+            if key in self.folder.runs() and self.library.run_row(key, path, None)["state"] == RUNNING:
                 raise CaptureError(f"{title_of(path)} is running in another window or terminal; stop it there first.")
             self.checks.forget(path)
             for part in self.parts.under_way(key):
@@ -269,7 +266,7 @@ class Studio:
     def delete_photo(self, key: str, photo: str) -> None:
         """Move one photo or clip of a capture into the trash."""
         capture = self.folder.capture(key)
-        names = {path.relative_to(capture).as_posix(): path for path in (*photos_of(capture), *clips_of(capture))}
+        names = _named(capture, (*photos_of(capture), *clips_of(capture)))
         if photo not in names:
             raise CaptureError("This photo is gone.")
         self.trash.put(names[photo], f"{photo} of {title_of(capture)}")
@@ -281,7 +278,7 @@ class Studio:
     def set_role(self, key: str, photo: str, role: str) -> None:
         """Say what a photo is."""
         capture = self.folder.capture(key)
-        if photo not in {path.relative_to(capture).as_posix() for path in photos_of(capture)}:
+        if photo not in _named(capture, photos_of(capture)):
             raise CaptureError("This photo is gone.")
         set_role(capture, photo, role)
 
@@ -300,14 +297,9 @@ class Studio:
 
     def change_queue(self, job: str, action: str) -> None:
         """Stop a job, move it to the front, or take it up again."""
-        actions: dict[str, Callable[[str], None]] = {
-            "stop": self.queue.stop,
-            "first": self.queue.first,
-            "again": self.queue.again,
-        }
-        if action not in actions:
-            raise CaptureError(f"{action!r:.40} is no action; {', '.join(actions)} are known.")
-        actions[action](job)
+        if action not in ACTIONS:
+            raise CaptureError(f"{action!r:.40} is no action; {', '.join(ACTIONS)} are known.")
+        getattr(self.queue, action)(job)
 
     # --- inside ------------------------------------------------------------------------------------------------------
 
@@ -345,3 +337,8 @@ class Studio:
             self._faults[step] = text
             with contextlib.suppress(OSError):  # the disk may be full
                 (self.folder.kept / f"fault_{step.strip('_')}.txt").write_text(text, "utf-8", "replace")
+
+
+def _named(capture: Path, files: Iterable[Path]) -> dict[str, Path]:
+    """Return files of a capture by their paths relative to it."""
+    return {file.relative_to(capture).as_posix(): file for file in files}

@@ -23,23 +23,22 @@ from capture.errors import UserError
 from capture.files.atomic import parse_json
 from capture.files.names import in_one_line
 from viewer.page.guard import COOKIE, is_own_page, is_same
+from viewer.stage.files import SAFE_HEADERS
 from viewer.studio.words import in_page_words, without_folder
 
 WEB = Path(str(resources.files("viewer.studio_server") / "web"))
 TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 REVALIDATE = {"Cache-Control": "no-cache"}
 SAFE = ("GET", "HEAD")
+LONGEST_TEXT = 1000  # letters of a value of a request
 LARGEST_BODY = 1 << 20  # bytes of a request that is no piece of a file
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
     "media-src 'self' blob:; frame-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 )
-OWN_HEADERS = {
+OWN_HEADERS = SAFE_HEADERS | {
     "Content-Security-Policy": POLICY,
     "X-Frame-Options": "DENY",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
 # Of a page made of a run's or capture's content: it gets no origin, so it reaches nothing of the studio.
@@ -151,15 +150,15 @@ async def read_object(request: Request) -> dict[str, Any]:
     return found
 
 
-def text_of(values: dict[str, Any], name: str, most: int = 1000) -> str:
+def text_of(values: dict[str, Any], name: str) -> str:
     """Return a text of a request.
 
     Raises:
         UserError: it is missing, no text, or too long.
     """
     value = values.get(name)
-    if not isinstance(value, str) or len(value) > most:
-        raise UserError(f"{name} of the request is no text of at most {most} letters.")
+    if not isinstance(value, str) or len(value) > LONGEST_TEXT:
+        raise UserError(f"{name} of the request is no text of at most {LONGEST_TEXT} letters.")
     return value
 
 

@@ -28,13 +28,13 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-from msgspec import Meta, Struct
+from msgspec import Meta
 from starlette.types import ASGIApp
 
-from capture.errors import CaptureError, UserError
-from capture.files.atomic import atomic_file, read_json, write_json
+from capture.errors import CaptureError
+from capture.files.atomic import atomic_file, write_json
 from capture.files.names import in_one_line
-from capture.files.schema import Number, Text, as_type
+from capture.files.schema import Count, Number, Text, read_kept
 from viewer.studio.sockets import free_socket, http_server
 
 DAYS = 30
@@ -101,8 +101,7 @@ class Phone:
     secret: Text
     name: Text
     role: Text = ""  # "camera" | "light" in live mode
-    joined: Number = 0.0  # seconds since 1970
-    seen: Number = 0.0
+    seen: Number = 0.0  # seconds since 1970
 
     @property
     def id(self) -> str:
@@ -112,24 +111,14 @@ class Phone:
 
 @dataclass
 class Door:
-    """What is kept while the switch is on."""
+    """What is kept, also in a file, while the switch is on."""
 
-    capture: str  # its key; phones send to this one
-    until: float  # seconds since 1970
-    token: str  # of the code that is shown
-    ports: tuple[int, int] = (0, 0)  # http, https
+    capture: Text  # its key; phones send to this one
+    until: Number  # seconds since 1970
+    token: Text  # of the code that is shown
+    ports: tuple[Port, Port] = (0, 0)  # http, https
     phones: dict[str, Phone] = field(default_factory=dict)  # by secret
-    shots: int = 0  # that the owner's page has asked for: a live camera takes one when it grows
-
-
-class _Kept(Struct):
-    """The file that a switch that is on leaves."""
-
-    capture: Text
-    until: Number
-    token: Text
-    ports: tuple[Port, Port]
-    phones: tuple[Phone, ...]
+    shots: Count = 0  # that the owner's page has asked for: a live camera takes one when it grows
 
 
 class Phones:
@@ -139,7 +128,7 @@ class Phones:
         """Open nothing yet; `app` makes what the listeners serve."""
         self._file, self._certificates, self._lock = file, certificates, threading.RLock()
         self._app = app(self)
-        self._door = _read(file)
+        self._door = read_kept(file, Door)
         self._servers: list[uvicorn.Server] = []
         self._threads: list[threading.Thread] = []
 
@@ -196,7 +185,7 @@ class Phones:
             if len(door.phones) >= MOST_PHONES:
                 raise CaptureError(f"{MOST_PHONES} phones are in already. Turn the switch off and on to start anew.")
             shown = in_one_line(name).strip()[:LONGEST_NAME] or "a phone"
-            phone = Phone(secrets.token_urlsafe(TOKEN_BYTES), shown, "", time.time(), time.time())
+            phone = Phone(secrets.token_urlsafe(TOKEN_BYTES), shown, seen=time.time())
             door.phones[phone.secret] = phone
             door.token = secrets.token_urlsafe(TOKEN_BYTES)
             self._note()
@@ -295,9 +284,7 @@ class Phones:
 
     def _note(self) -> None:
         if self._door is not None:
-            phones = [asdict(phone) for phone in self._door.phones.values()]
-            kept = {"capture": self._door.capture, "until": self._door.until, "token": self._door.token}
-            write_json(self._file, kept | {"ports": list(self._door.ports), "phones": phones})
+            write_json(self._file, asdict(self._door))
 
 
 def _run(server: uvicorn.Server, listener: socket.socket) -> None:
@@ -317,11 +304,3 @@ def own_addresses() -> list[str]:
     for rows in psutil.net_if_addrs().values():
         found += [row.address for row in rows if row.family == socket.AF_INET and not row.address.startswith("127.")]
     return list(dict.fromkeys(found))
-
-
-def _read(file: Path) -> Door | None:
-    try:
-        kept = as_type(read_json(file), _Kept, str(file))
-        return Door(kept.capture, kept.until, kept.token, kept.ports, {phone.secret: phone for phone in kept.phones})
-    except (OSError, ValueError, UserError):
-        return None

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from concurrent.futures import Future
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
+from calibration.board.printing import draw_pdf
 from capture.errors import CaptureError
 from capture.files.regular import is_regular, read_regular
 from viewer.stage.files import HEADERS, HTML
@@ -65,7 +67,7 @@ def _questions(studio: Studio, phones: Phones) -> list[Route]:
         ask("/api/board_shapes", lambda r: boards.board_shapes(r.query_params.get("board", ""))),
         ask("/board.pdf", _board_pdf),
         ask("/api/phones", lambda _: phones.row()),
-        ask("/api/code", lambda r: _code(phones, "live" in r.query_params)),
+        ask("/api/code", lambda r: Response(phones.code("live" in r.query_params), media_type="image/svg+xml")),
         ask("/api/picture", lambda r: _made(studio.picture(_key(r), r.query_params.get("photo", "")), "image/jpeg")),
         ask("/api/run_picture", lambda r: _made(studio.run_picture(_key(r)), "image/jpeg")),
         ask("/api/growing", lambda r: _growing(studio.growing.picture(_key(r)))),
@@ -89,11 +91,8 @@ def _changes(studio: Studio, phones: Phones) -> list[Route]:
 
         return Route(f"/api/{name}", endpoint, methods=["POST"])
 
-    async def keep_document(request: Request) -> Response:
-        return await _keep_document(studio, request)
-
     return [
-        Route("/stage/{key:path}/stage.json", keep_document, methods=["PUT"]),
+        Route("/stage/{key:path}/stage.json", partial(_keep_document, studio), methods=["PUT"]),
         change("new", studio.new_capture, "title"),
         change("try_example", studio.try_example),
         change("add", studio.folder.add, "key"),
@@ -160,21 +159,16 @@ def _key(request: Request) -> str:
 
 
 def _board_pdf(request: Request) -> Response:
-    pdf = boards.board_pdf(request.query_params.get("board", ""), request.query_params.get("paper", "a4"))
-    return Response(pdf, media_type="application/pdf")
-
-
-def _code(phones: Phones, is_live: bool) -> Response:
-    return Response(phones.code(is_live), media_type="image/svg+xml")
+    page = boards.board_page(request.query_params.get("board", ""), request.query_params.get("paper", "a4"))
+    return Response(draw_pdf(page), media_type="application/pdf")
 
 
 def _made(found: "Path | Future[Any]", kind: str) -> Response:
     """Return a file once it is made; the address of a picture changes with its content, so browsers may keep it."""
     if isinstance(found, Path):
         return FileResponse(found, media_type=kind, headers=KEPT)
-    if not found.done():
-        return JSONResponse({"wait": True}, 202)
-    found.result()
+    if found.done():
+        found.result()  # or its error
     return JSONResponse({"wait": True}, 202)
 
 

@@ -140,39 +140,24 @@ def serve(
         if opens is not None:
             opens(f"{address}&again=1{at}")
         return
-    try:
-        _serve(folder, port, opens, say, at)
-    finally:
-        folder.release()
-
-
-def _serve(
-    folder: StudioFolder,
-    port: int,
-    opens: Callable[[str], object] | None,
-    say: Callable[[str], object],
-    at: str,
-) -> None:
-    studio = Studio(folder)
-    phones = Phones(folder.kept / "phones.json", folder.kept / "phones", PhoneRoutes(studio).app)
-    token = folder.token()
-    listener = free_socket(HOST, port)
-    address = f"http://localhost:{listener.getsockname()[1]}/?token={token}"
-    folder.note_address(address)
-    server = http_server(Gate(owner_app(studio, phones), HOST, OwnerSecret(token)))
-    studio.start()
-    phones.resume()
-    say(f"Open {address}")
-    say(f"Captures and runs of {folder.root}. Ctrl-C closes the studio; runs go on.")
-    if opens is not None:
-        threading.Timer(0.5, opens, (address + at,)).start()
-    try:
+    with contextlib.ExitStack() as ending:
+        ending.callback(folder.release)
+        studio = Studio(folder)
+        phones = Phones(folder.kept / "phones.json", folder.kept / "phones", PhoneRoutes(studio).app)
+        token, listener = folder.token(), ending.enter_context(free_socket(HOST, port))
+        address = f"http://localhost:{listener.getsockname()[1]}/?token={token}"
+        folder.note_address(address)
+        server = http_server(Gate(owner_app(studio, phones), HOST, OwnerSecret(token)))
+        studio.start()
+        ending.callback(studio.close)
+        phones.resume()
+        ending.callback(phones.close)
+        say(f"Open {address}")
+        say(f"Captures and runs of {folder.root}. Ctrl-C closes the studio; runs go on.")
+        if opens is not None:
+            threading.Timer(0.5, opens, (address + at,)).start()
         with contextlib.suppress(KeyboardInterrupt):
             server.run(sockets=[listener])
-    finally:
-        phones.close()
-        studio.close()
-        listener.close()
 
 
 def _studio_of(root: Path) -> tuple[Path, str]:

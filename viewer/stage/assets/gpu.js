@@ -34,23 +34,21 @@ export function program(vertex, fragment, defines = "") {
   return { made, at: (name) => { if (!isChecked) check(); return (at[name] ??= gl.getUniformLocation(made, name)); } };
 }
 
-export function flat(filter, wrap = gl.CLAMP_TO_EDGE) {
+export function flat(filter) {
   const texture = gl.createTexture();
   gl.bindTexture(gl.TEXTURE_2D, texture);
-  for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, wrap);
+  for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, filter);
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, filter);
   return texture;
 }
 
-export function pictureTexture(picture, isColour, smaller = true) {
+export function pictureTexture(picture, isColour) {
   const texture = flat(gl.LINEAR);
   gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
   gl.texImage2D(gl.TEXTURE_2D, 0, isColour ? gl.SRGB8_ALPHA8 : gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, picture);
-  if (smaller) {
-    gl.generateMipmap(gl.TEXTURE_2D);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
-  }
+  gl.generateMipmap(gl.TEXTURE_2D);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
   return texture;
 }
 
@@ -62,7 +60,7 @@ export function shareTexture(shares, side) {
   return texture;
 }
 
-export function depthTexture(width, height, compares) {
+function depthTexture(width, height, compares) {
   const texture = flat(compares ? gl.LINEAR : gl.NEAREST);
   gl.texStorage2D(gl.TEXTURE_2D, 1, gl.DEPTH_COMPONENT24, width, height);
   if (compares) {

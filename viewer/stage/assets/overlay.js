@@ -76,14 +76,13 @@ export function drawBar() {
 const hiddenNotes = new Map();
 
 // Redraws arrows, lengths and their texts; `settled` also asks which are behind the surface, which takes longer.
-export function drawNotes(settled, pending = null) {
-  if (!stage.notes.length && !pending && !byId("notes").firstChild) return;
+export function drawNotes(settled) {
+  if (!stage.notes.length && !byId("notes").firstChild) return;
   const svg = byId("notes"), width = innerWidth, height = innerHeight, camera = cameraNow();
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   svg.replaceChildren();
   if (!shown.layers.notes) return;
-  const list = pending ? [...stage.notes, pending] : stage.notes;
-  list.forEach((note, i) => {
+  stage.notes.forEach((note, i) => {
     const key = JSON.stringify([note.at, note.to]);
     if (settled) hiddenNotes.set(key, isHidden(note.at));
     const group = document.createElementNS(ns, "g");

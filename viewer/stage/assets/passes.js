@@ -1,5 +1,5 @@
 // The passes: surface (G-buffer), depth (shadow map), blur, light, show, lines. Each takes where it draws and from where.
-import { add, axesTowards, clipFrom, cross, dot, norm, unit } from "./vectors.js";
+import { add, axesTowards, clipFrom, cross, norm, unit } from "./vectors.js";
 import { cameraOf, facts, groundPlace, toPage } from "./scene.js";
 import { coarser } from "./coarse.js";
 import { bind, gl, pictureTexture, plainDepth, program, shareTexture, target } from "./gpu.js";
@@ -317,6 +317,5 @@ export function lampPoint(place, radius, reach, angle) {
   return add(add(place, across, r * Math.cos(angle)), cross(axis, across), r * Math.sin(angle));
 }
 
-export const pictureDistance = (p, camera) => dot(add(p, camera.eye, -1), camera.forward);
 export const gBufferFormats = () => [[gl.RGBA8, gl.UNSIGNED_BYTE], [gl.RGBA16F, gl.HALF_FLOAT],
   [gl.RGBA32UI, gl.UNSIGNED_INT, gl.RGBA_INTEGER], ...(facts.gloss ? [[gl.RGBA8, gl.UNSIGNED_BYTE]] : [])];

@@ -18,7 +18,6 @@ let coarse = COARSE_AT_FIRST, atRest = 1, pace = 0, restsAt = 0, scheduled = fal
 let surfaceOf = "", shadowOf = "", light = null, seen = null, sizes = 0;
 export const pace_ = { frames: [], pointer: [], firstPaint: 0 };
 export const samplesDone = () => count;
-export const lastView = () => seen;
 
 export function startRenderer(lines, drawn) { painter = lines; firstDrawn = drawn; draw("stage"); }
 

@@ -2,13 +2,14 @@
 
 import { h } from "./dom.js";
 import { dome } from "./hemisphere.js";
-import { complaint, picked, sending, unused } from "./upload.js";
+import { chooser, complaint, sending, unused } from "./upload.js";
 import { voice } from "./voice.js";
 
 /** The view of one phone; `phone` is what all views share: its state, its sender, and how to draw again. */
 export function album(phone) {
   const loud = voice(phone.draw);
   let role = "";
+  const take = (files) => phone.sender.add(files, role);
   addEventListener("beforeunload", (event) => { if (phone.sender.open.length) event.preventDefault(); });
 
   const page = ({ state, problem, sender }) => {
@@ -18,7 +19,7 @@ export function album(phone) {
       problem && h("p", { class: "bad" }, problem),
       h("section", { class: "panel" },
         h("p", {}, "Photograph with the camera app: exposure and focus locked, camera on a tripod. Then choose all photos here."),
-        h("div", { class: "bar" }, chooser("Choose photos", { accept: "image/*,video/*" }, "main"), chooser("Take one now", { accept: "image/*", capture: "environment", multiple: false })),
+        h("div", { class: "bar" }, chooser("Choose photos", { accept: "image/*,video/*" }, take, "main"), chooser("Take one now", { accept: "image/*", capture: "environment", multiple: false }, take)),
         h("label", {}, "They show ", h("select", { "aria-label": "What the photos show", value: role, onchange: (event) => { role = event.target.value; } },
           [["", "what they look like"], ["board", "the board, in room light"], ["lit", "the object under the flashlight"], ["light", "what the flashlight phone sees"], ["side", "the object from the side"]]
             .map(([value, words]) => h("option", { value, selected: value === role }, words)))),
@@ -36,12 +37,6 @@ export function album(phone) {
         state.coach.lights.length > 0 && dome(state.coach.lights.map((light) => ({ ...light, used: true })))),
     ].filter(Boolean);
   };
-
-  function chooser(words, more, kind = "") {
-    const input = h("input", { type: "file", multiple: true, hidden: true, "aria-hidden": "true", tabindex: "-1", ...more,
-      onchange: (event) => { phone.sender.add(picked(event.target), role); event.target.value = ""; } });
-    return h("span", { class: "chooser" }, input, h("button", { class: kind, onclick: (event) => event.currentTarget.parentNode.querySelector("input").click() }, words));
-  }
 
   const heard = (state) => loud.hear(state.bad, state.coach.advice);
   return { title: "Send photos to Shadowgraph", pause: () => (document.hidden ? 5000 : 1500), page, heard };

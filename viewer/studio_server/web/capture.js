@@ -1,10 +1,10 @@
 // One capture: its board, its photos as they arrive, the verdict, and the start of a run.
 
-import { PRESETS, about, ask as question, attempt, bytes, change, day, dialog, duration, failure, h, key, picture, plural, presetWords, size, toast } from "./dom.js";
+import { PRESETS, about, ask as question, attempt, bytes, change, day, dialog, duration, failure, h, key, picture, plural, presetWords, rename, size, toast } from "./dom.js";
 import { boardOnScreen, printLink } from "./board.js";
 import { dome } from "./hemisphere.js";
 import { phones } from "./phones.js";
-import { Sender, complaint, dropped, picked, sending, unused } from "./upload.js";
+import { Sender, chooser, complaint, dropped, sending, unused } from "./upload.js";
 import { voice } from "./voice.js";
 
 const ROLES = { "": "find out", board: "board", lit: "flashlight", light: "flashlight's phone", dark: "light off", side: "side photo" };
@@ -14,10 +14,10 @@ const senders = new Map(); // they go on while another view is shown
 export function capture(name, again) {
   if (!senders.has(name)) senders.set(name, new Sender(name, () => window.dispatchEvent(new Event("sent"))));
   const sender = senders.get(name);
-  const phone = phones(name, again);
+  const phone = phones(name, again), take = (files) => sender.add(files);
   let boards = null, times = [], timed = -1, preset = "draft", isOver = false;
   const loud = voice(again);
-  const view = { pause: 1000, close: () => removeEventListener("sent", again) };
+  const view = { pause: 1000 };
   let last = 0;
   addEventListener("sent", view.onsent = () => { if (Date.now() - last > 400) { last = Date.now(); again(); } });
   view.close = () => removeEventListener("sent", view.onsent);
@@ -33,7 +33,7 @@ export function capture(name, again) {
     view.pause = row.photos.some((photo) => !photo.looked) ? 400 : 1000; // what is wrong with a new photo is said soon
     document.title = `${row.title} · Shadowgraph studio`;
     return [
-      h("div", { class: "bar" }, h("h1", { class: "grow" }, row.title), h("button", { onclick: () => rename(row) }, "Rename"),
+      h("div", { class: "bar" }, h("h1", { class: "grow" }, row.title), h("button", { onclick: () => rename(row, again) }, "Rename"),
         h("a", { class: "button", href: "#/" }, "All captures")),
       h("div", { class: "columns" },
         h("div", {}, photosPanel(row), boardPanel(row)),
@@ -51,7 +51,7 @@ export function capture(name, again) {
         sender.add(await dropped(event.dataTransfer));
       } },
         h("p", {}, "Drop photos, a folder, a .zip or a clip here: the board in room light, and the object under the flashlight."),
-        h("div", { class: "bar" }, chooser("Choose files", {}), chooser("Choose a folder", { webkitdirectory: true }), phone.button())),
+        h("div", { class: "bar" }, chooser("Choose files", {}, take), chooser("Choose a folder", { webkitdirectory: true }, take), phone.button())),
       phone.panel(), sending(sender), row.stalled > 0 && stalled(row),
       row.refused.length > 0 && h("div", { class: "bad small" }, h("p", {}, "Not taken:"),
         h("ul", { class: "plain" }, row.refused.slice(-5).map((one) => h("li", {}, complaint(one.name, one.why), " ",
@@ -68,12 +68,6 @@ export function capture(name, again) {
     return h("div", { class: "warn", key: "stalled" },
       h("p", {}, `${plural(row.stalled, "file")} stopped in the middle: the phone or page that sends ${row.stalled === 1 ? "it" : "them"} has left, or lost the network. Sending goes on by itself when it is back.`),
       h("button", { onclick: () => attempt(async () => { await change("go_on_without", { key: row.key }); again(); }) }, "Go on without"));
-  }
-
-  function chooser(words, more) {
-    const input = h("input", { type: "file", multiple: true, hidden: true, "aria-hidden": "true", tabindex: "-1", ...more,
-      onchange: (event) => { sender.add(picked(event.target)); event.target.value = ""; } });
-    return h("span", { class: "chooser" }, input, h("button", { onclick: (event) => event.currentTarget.parentNode.querySelector("input").click() }, words));
   }
 
   /** What a photo may show. Of one in the folder of a role the folder says it, and another choice moves it there. */
@@ -175,9 +169,5 @@ export function capture(name, again) {
       run.state === "failed" && h("div", { class: "bad small" }, run.sentence)))));
   }
 
-  const rename = (row) => attempt(async () => {
-    const title = await dialog(`Rename ${row.title}`, "", "Rename", { text: row.title });
-    if (title) { await change("rename", { key: row.key, title }); again(); }
-  });
   return view;
 }

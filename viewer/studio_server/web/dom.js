@@ -152,6 +152,12 @@ export function dialog(title, words, action, { text = null, isDanger = false, bo
   });
 }
 
+/** Ask for another title of a capture or run; `again` draws the page anew. */
+export const rename = ({ key: place, title: before }, again) => attempt(async () => {
+  const title = await dialog(`Rename ${before}`, "", "Rename", { text: before });
+  if (title) { await change("rename", { key: place, title }); again(); }
+});
+
 /** Why something failed: what is wrong, what to do, and the rest of a long text smaller. */
 export function failure(text) {
   const [first, second, ...rest] = text.split(/(?<=[.:]) (?=[A-Z"])/);

@@ -20,9 +20,9 @@ export function dome(lights) {
     }));
 }
 
-export const SIDES = ["the camera's side", "the camera's right", "the right", "behind, right", "behind", "behind, left", "the left", "the camera's left"];
+const SIDES = ["the camera's side", "the camera's right", "the right", "behind, right", "behind", "behind, left", "the left", "the camera's left"];
 
-export function sector(azimuth) { return ((Math.round((azimuth * SECTORS) / 360) % SECTORS) + SECTORS) % SECTORS; }
+function sector(azimuth) { return ((Math.round((azimuth * SECTORS) / 360) % SECTORS) + SECTORS) % SECTORS; }
 
 function place({ azimuth, elevation }) {
   const reach = (R * (90 - Math.max(0, elevation))) / 90, turn = (azimuth * Math.PI) / 180;

@@ -1,6 +1,6 @@
 // All captures and runs of the folder.
 
-import { attempt, bytes, change, day, dialog, duration, h, key, picture, plural, presetWords, size, toast } from "./dom.js";
+import { attempt, bytes, change, day, dialog, duration, h, key, picture, plural, presetWords, rename, size, toast } from "./dom.js";
 import { queue } from "./queue.js";
 import { frame } from "./result.js";
 
@@ -83,7 +83,7 @@ export function home(_, again) {
         shown && h("a", { class: "button small", href: `#/run/${key(shown.key)}` }, "Open"),
         shown && h("button", { "aria-pressed": String(chosen.includes(shown.key)), onclick: () => mark(shown.key) },
           chosen.includes(shown.key) ? "✓ Compare" : "Compare"),
-        h("button", { "aria-label": `Rename ${card.title}`, onclick: () => rename(card) }, "Rename"),
+        h("button", { "aria-label": `Rename ${card.title}`, onclick: () => rename(card, again) }, "Rename"),
         h("button", { class: "danger", "aria-label": `Delete ${card.title}`, onclick: () => remove(card) }, "Delete")));
   }
 
@@ -109,11 +109,6 @@ export function home(_, again) {
     if (chosen.length === 1) toast("Choose a second one to compare it with.");
     again();
   }
-
-  const rename = (card) => attempt(async () => {
-    const title = await dialog(`Rename ${card.title}`, "", "Rename", { text: card.title });
-    if (title) { await change("rename", { key: card.key, title }); again(); }
-  });
 
   const remove = (card) => attempt(async () => {
     const runs = card.kind === "capture" && card.runs.length ? ` Its ${plural(card.runs.length, "run")} stay until deleted, too.` : "";

@@ -2,11 +2,13 @@
 
 import { about, attempt, bytes, change, duration, h, key, presetWords } from "./dom.js";
 
+/** The seconds that jobs take together; null where that is not known. */
+export const leftOf = (jobs) => (jobs.some((job) => job.left_s === null || job.left_s === undefined) ? null : jobs.reduce((sum, job) => sum + job.left_s, 0));
+
 /** `jobs`: in the order in which they run; `again` draws the page anew. */
 export function queue(jobs, again) {
   if (!jobs.length) return null;
-  const lefts = jobs.map((job) => job.left_s), isKnown = lefts.every((left) => left !== null && left !== undefined);
-  const told = isKnown ? `all done in ${about(lefts.reduce((sum, left) => sum + left, 0))}` : "how long they take is not known yet";
+  const left = leftOf(jobs), told = left === null ? "how long they take is not known yet" : `all done in ${about(left)}`;
   const act = (job, action) => attempt(async () => { await change("queue", { job: job.id, action }); again(); });
   return h("section", { class: "panel queue", key: "queue" }, h("h2", {}, "At work"),
     h("p", { class: "quiet" }, `One run at a time, ${jobs.length} in the queue; ${told}.`),

@@ -1,6 +1,7 @@
 // A run: its progress while it runs, its result once it is finished; two results side by side.
 
-import { about, ask, attempt, change, dialog, duration, failure, h, key, plural, presetWords, size } from "./dom.js";
+import { about, ask, attempt, change, dialog, duration, failure, h, key, plural, presetWords, rename, size } from "./dom.js";
+import { leftOf } from "./queue.js";
 import { saving } from "./save.js";
 
 export function run(name, again) {
@@ -21,7 +22,7 @@ export function run(name, again) {
       h("h1", {}, one.title),
       one.state === "finished" ? result(one) : progress(one, before(state.queue, one), card.kind === "capture" ? `#/capture/${key(card.key)}` : ""),
       h("div", { class: "bar", key: "about" }, card.kind === "capture" && h("a", { class: "button", href: `#/capture/${key(card.key)}` }, "Its photos"),
-        h("button", { onclick: () => rename(one) }, "Rename"),
+        h("button", { onclick: () => rename(one, again) }, "Rename"),
         h("button", { class: "danger", disabled: one.state === "running" || one.state === "waiting", onclick: () => remove(one) }, "Delete"),
         h("a", { class: "button", href: "#/" }, "All captures")),
     ];
@@ -29,8 +30,8 @@ export function run(name, again) {
 
   /** How long the runs before this one take, in words; "" where that is not known. */
   function before(queued, one) {
-    const lefts = queued.slice(0, Math.max(0, queued.findIndex((job) => job.run === one.key))).map((job) => job.left_s);
-    return lefts.length && lefts.every((left) => left !== null && left !== undefined) ? ` It begins in ${about(lefts.reduce((sum, left) => sum + left, 0))}.` : "";
+    const place = queued.findIndex((job) => job.run === one.key), left = place > 0 ? leftOf(queued.slice(0, place)) : null;
+    return left === null ? "" : ` It begins in ${about(left)}.`;
   }
 
   function progress(one, begins, photos) {
@@ -70,10 +71,6 @@ export function run(name, again) {
 
   const fill = () => attempt(() => document.querySelector("iframe.result").requestFullscreen());
   const queue = (one, action) => attempt(async () => { await change("queue", { job: one.job, action }); again(); });
-  const rename = (one) => attempt(async () => {
-    const title = await dialog(`Rename ${one.title}`, "", "Rename", { text: one.title });
-    if (title) { await change("rename", { key: one.key, title }); again(); }
-  });
   const remove = (one) => attempt(async () => {
     if (await dialog(`Delete ${one.title}?`, "It goes into the trash, from where it can be put back.", "Delete", { isDanger: true })) {
       await change("delete", { key: one.key });
@@ -147,11 +144,9 @@ export function frame(address, title, date = "") {
   return element;
 }
 
-const frameOf = (source) => [...document.querySelectorAll("iframe.result")].find((one) => one.contentWindow === source);
-
 /** A result has no origin, so it can ask nothing of the studio: its notes are kept with its run by this page. */
 addEventListener("message", async ({ source, data }) => {
-  const element = frameOf(source);
+  const element = [...document.querySelectorAll("iframe.result")].find((one) => one.contentWindow === source);
   if (!element || typeof data.keep !== "string") return;
   let kept = "";
   try {
@@ -174,7 +169,7 @@ addEventListener("keydown", (event) => {
   for (const one of frames) one.contentWindow.postMessage({ press: { key: event.key, shiftKey: event.shiftKey, ctrlKey: event.ctrlKey } }, "*");
 });
 
-export function compare(names, again) {
+export function compare(names) {
   const view = { pause: 5000, wide: true };
   view.render = async (ask) => {
     const state = await ask("/api/state");
@@ -189,6 +184,5 @@ export function compare(names, again) {
           one.guessed !== null && `${Math.round(100 * (one.guessed || 0))} % guessed`].filter(Boolean).map((text) => h("li", {}, text)))))),
     ];
   };
-  void again;
   return view;
 }

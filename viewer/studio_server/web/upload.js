@@ -148,8 +148,14 @@ async function walk(entry, place, found) {
   }
 }
 
-/** The files of an <input type=file>. */
-export function picked(input) {
+/** A button that lets a person choose files: {file, path}, for `take`; `more`: attributes of the input. */
+export function chooser(words, more, take, kind = null) {
+  const input = h("input", { type: "file", multiple: true, hidden: true, "aria-hidden": "true", tabindex: "-1", ...more,
+    onchange: (event) => { take(picked(event.target)); event.target.value = ""; } });
+  return h("span", { class: "chooser" }, input, h("button", { class: kind, onclick: (event) => event.currentTarget.parentNode.querySelector("input").click() }, words));
+}
+
+function picked(input) {
   return [...input.files].map((file) => ({ file, path: file.webkitRelativePath || file.name })).filter(
     ({ path }) => !path.split("/").some((part) => part.startsWith(".") || part === "gt" || part === "__MACOSX"));
 }
