@@ -16,7 +16,6 @@ from calibration.calibration import load_calibration
 from calibration.known_scene import KnownScene
 from capture.files.atomic import write_json
 from reconstruct.run import pipeline
-from reconstruct.run import report_json as summary
 from reconstruct.run_folder import forecast
 from reconstruct.run_folder.folder import PLAN, RunFolder
 from reconstruct.run_folder.forecast import give_memory_back, memory_room, share_memory_among_threads
@@ -94,12 +93,14 @@ def test_a_run_keeps_to_its_decision_and_writes_which_photos_it_left_out(tmp_pat
             thinned = kept.first
             assert sum(light.used for light in thinned.lights) == 40
             assert load_calibration(run.file("calibration.json")) == thinned
-        assert "40 of 50 photos" in summary._reduced(run)[0]
+        plan = read_plan(run.file(PLAN))
+        assert plan and OVERRIDE in plan.sentence and "40 of 50 photos" in plan.sentence
         run.discard(PLAN)
         options = RunOptions(preset="draft", memory=64.0)
         assert all(light.used for light in pipeline._within_memory(source, options, run, kept).first.lights)
         assert all(light.used for light in load_calibration(run.file("calibration.json")).lights)
-        assert not summary._reduced(run)
+        plan = read_plan(run.file(PLAN))
+        assert plan is None or OVERRIDE not in plan.sentence
 
 
 def test_what_the_allocator_is_told_leaves_what_is_held(monkeypatch):

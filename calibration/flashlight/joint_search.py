@@ -24,8 +24,8 @@ from calibration.flashlight.model import (
     across,
     cell_residuals,
     log_albedo,
+    log_exposed,
     log_pictured,
-    middle_light,
 )
 from calibration.flashlight.pictured import bent, places_held, without_wall
 from calibration.flashlight.wall import NO_WALL, WALL_TERMS, Wall
@@ -267,7 +267,8 @@ def looked_for_aims(flashlights: Flashlights, evidence: Evidence, weight: Sample
     Args:
         weight: of the samples, as a fit left them: they tell the ground's albedo.
     """
-    thin, middle = _without_albedo(flashlights, evidence, weight), middle_light(flashlights, evidence)
+    thin = _without_albedo(flashlights, evidence, weight)
+    middle = float(np.median(log_exposed(flashlights, evidence)))
     targets, power = flashlights.targets.copy(), flashlights.log_power.copy()
     for k in range(len(targets)):
         own = thin.at(thin.weight[k] > 0)
@@ -301,7 +302,7 @@ def _misfits(
 
     Args:
         own: of the cells that photo k shows, without albedo.
-        middle: as middle_light gives it of all photos.
+        middle: median of log_exposed of all photos.
     """
     n = len(targets)
     state = replace(flashlights, positions=np.repeat(place[None], n, 0), targets=targets, log_power=np.zeros(n))

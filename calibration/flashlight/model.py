@@ -145,20 +145,16 @@ def log_irradiance(flashlights: Flashlights, evidence: Evidence) -> Samples:
 
 def log_pictured(flashlights: Flashlights, evidence: Evidence, middle: float | None = None) -> Samples:
     """Return the log irradiance as the pictures' response shows it; middle: of the series, if evidence is a part."""
-    light = log_irradiance(flashlights, evidence)
+    light, exposed = log_irradiance(flashlights, evidence), log_exposed(flashlights, evidence)
     if not len(flashlights.response):
         return light
-    middle = middle_light(flashlights, evidence) if middle is None else middle
-    return light + bend(light + _exposure(evidence) - middle, flashlights.response)
+    return light + bend(exposed - (np.median(exposed) if middle is None else middle), flashlights.response)
 
 
-def middle_light(flashlights: Flashlights, evidence: Evidence) -> float:
-    """Return the median log of light times exposure, about which the response is stated."""
-    return float(np.median(log_irradiance(flashlights, evidence) + _exposure(evidence)))
-
-
-def _exposure(evidence: Evidence) -> Float[np.ndarray, "photos 1"] | float:
-    return 0.0 if evidence.exposure is None else evidence.exposure[:, None]
+def log_exposed(flashlights: Flashlights, evidence: Evidence) -> Samples:
+    """Return the log of light times exposure; the response is stated about its median over the series."""
+    light = log_irradiance(flashlights, evidence)
+    return light if evidence.exposure is None else light + evidence.exposure[:, None]
 
 
 def cosines(flashlights: Flashlights, evidence: Evidence) -> Samples:
@@ -246,7 +242,8 @@ def jacobian(flashlights: Flashlights, evidence: Evidence):
     shared = [by_term * share[..., None], np.stack([np.ones_like(total), *by_wall], -1) / total[..., None]]
     if not len(flashlights.response):
         return flashlight, np.concatenate(shared, -1)
-    light = np.log(total) + _exposure(evidence) - middle_light(flashlights, evidence)
+    light = log_exposed(flashlights, evidence)
+    light = light - np.median(light)
     slope = 1 + (slopes(light) @ flashlights.response)[..., None]
     return flashlight * slope, np.concatenate([*(slope * one for one in shared), integrals(light)], -1)
 

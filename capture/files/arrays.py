@@ -15,6 +15,7 @@ from jaxtyping import Float
 from numpy.lib import format as npy
 
 from capture.errors import CalibrationError
+from capture.files.names import in_one_line
 from capture.files.regular import why
 
 LARGEST_FILE = 64 * 2**20  # bytes, unpacked: a hundred thousand lights, or a depth map of eight megapixels
@@ -56,7 +57,8 @@ def read_npz(path: Path, names: tuple[str, ...], largest: int = LARGEST_FILE) ->
             missing = [name for name in names if name not in found]
             if missing:
                 raise CalibrationError(
-                    f"{path} holds {', '.join(sorted(found)[:8])[:200] or 'nothing'}; {', '.join(missing)} was needed."
+                    f"{path} holds {in_one_line(', '.join(sorted(found)[:8])[:200]) or 'nothing'}; "
+                    f"{', '.join(missing)} was needed."
                 )
             return {name: _numbers(_unpacked(packed, found[name])) for name in names}
     except _DAMAGED as error:
