@@ -14,8 +14,8 @@ from calibration.light import log_beam_gain
 
 EXTRA_TERMS = 3  # r2, r3, r4: fewer cannot follow a real beam (position errors of 2-6 % with none)
 SMOOTH_TERMS = 1 + EXTRA_TERMS  # what comes after these are splines
-RING_TERMS = 32  # up to 64 degrees off the axis
-RING_STEP = 0.0175  # of u from one spline to the next: 2 degrees at 30 degrees, where LEDs have rings
+RING_TERMS = 16  # up to 64 degrees off the axis
+RING_STEP = 0.035  # of u from one spline to the next: 4 degrees at 30 degrees, where LEDs have rings
 PROFILE = 2000  # places at which the splines' sum is tabulated
 
 Samples = Float[np.ndarray, "*batch"]

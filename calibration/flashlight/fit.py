@@ -123,9 +123,7 @@ def collect(
             "(25 or more are better). Take more photos with the flashlight in different places."
         )
     cells = sample_ground(stack, posed_camera, photos)
-    gains = np.array(stack.gains)[photos]
-    evidence = Evidence.of(cells, gains, posed_camera.ground_height)
-    evidence = replace(evidence, exposure=None if stack.is_linear else np.log(gains))
+    evidence = Evidence.of(cells, np.array(stack.gains)[photos], posed_camera.ground_height)
     refuse_still_light(evidence)
     return evidence, photos
 
@@ -149,7 +147,7 @@ def misfits(residual: Float[np.ndarray, "trials cells"], common: float | None):
     return size, offset
 
 
-def thinned(evidence: Evidence) -> Evidence:
+def _thinned(evidence: Evidence) -> Evidence:
     """Return at most FEW_CELLS of the cells that are known in most photos: enough for a search."""
     known = np.flatnonzero((evidence.weight > 0).mean(0) > 0.5)
     if len(known) < MIN_GROUND:
@@ -166,7 +164,7 @@ def first_fits(evidence: Evidence) -> FirstFits:
     Raises:
         CalibrationError: too little ground is usable in most photos.
     """
-    thin = thinned(evidence)
+    thin = _thinned(evidence)
     starts = []
     for beam in START_BEAMS:
         for distance in hand.DISTANCES[1:-1]:
@@ -176,7 +174,8 @@ def first_fits(evidence: Evidence) -> FirstFits:
     found = [refine(state, thin, ALIKE_POWER, free_tangent, FAR[8:] + NEAR) for _, _, state in better]
     costs = np.array([cost(state, thin, weight, ALIKE_POWER) for state, weight in found])
     best, weight = found[int(costs.argmin())]
-    return FirstFits(tuple(state for state, _ in found), costs, independent(best, weight, thin))
+    independent = weight.sum() / evidence.weight.max() / design_effect(cell_residuals(best, thin, weight), weight, thin)
+    return FirstFits(tuple(state for state, _ in found), costs, max(independent, 1.0))
 
 
 def first_guess(evidence: Evidence) -> Flashlights:
@@ -213,12 +212,6 @@ def _on_sphere(evidence: Evidence, distance: float, beam: float) -> Flashlights:
         power = np.array([offset[k] for (_, offset), k in zip(best, index, strict=True)])
         shown = table[index] + power[:, None]
     return state(places[index])
-
-
-def independent(state: Flashlights, weight: Samples, evidence: Evidence) -> float:
-    """Return how many of a fit's weighted samples err independently."""
-    alike = design_effect(cell_residuals(state, evidence, weight), weight, evidence)
-    return max(float(weight.sum() / evidence.weight.max()) / alike, 1.0)
 
 
 def design_effect(residual: Samples, weight: Samples, evidence: Evidence) -> float:

@@ -1,7 +1,7 @@
 """All lights from outlines of shadows and the shading of all photos together, from rough starts.
 
 The work is bounded by the number of photos: two passes from each start, one from what is best of all of them photo by
-photo, and a few with other walls and at other distances. Photos that are at odds add none.
+photo, a few with other walls and at other distances, and one short fit per contrast. Photos that are at odds add none.
 """
 
 import logging
@@ -23,11 +23,9 @@ from calibration.flashlight.model import (
     Samples,
     across,
     cell_residuals,
-    log_albedo,
-    log_exposed,
-    log_pictured,
+    free_tangent,
+    log_irradiance,
 )
-from calibration.flashlight.pictured import bent, places_held, without_wall
 from calibration.flashlight.wall import NO_WALL, WALL_TERMS, Wall
 from calibration.lights import hand
 from capture.checks.robust import spread
@@ -52,6 +50,8 @@ TRIED = 4  # of a round's: those that are fitted
 NEAR_INFINITY = 0.05  # a light that would be moved 20 times as far stays
 # tried first: as near as a wall behind a thing stands (mm), of middle grey; the fit moves them
 WALLS = tuple(np.array([azimuth, np.log(hand.NEAREST * 1.4), 0.5]) for azimuth in np.arange(8) * np.pi / 4)
+CONTRASTS = (1.1, 1.0, 0.9, 0.8, 0.7)  # of log brightness in the picture over that in the scene, that are tried
+CONTRAST_WIDTH = 0.1  # prior sigma of its logarithm about 0: phones lift whole regions that are dark
 _Found = tuple[float, FlashlightFit, float]  # cost of its outlines, fit, misfit of its shading (log units)
 LOOSE = Priors(log_power=0.03, power_outlier=0.5)  # one lamp: .006 to .03 where it and the phone's exposure hold still
 
@@ -113,7 +113,7 @@ def _shaded(like: _Found, places: Float[np.ndarray, "photos 3"], wall: Wall, evi
     """Return the state with such places and wall whose beam, aims and powers shade the ground best."""
     state = replace(like[1].flashlights, positions=places, wall=wall)
     weighted = _weighted(evidence, USUAL_MISFIT)
-    state, weight = refine(state, replace(weighted, outlines=None), LOOSE, places_held, FAR[:6])
+    state, weight = refine(state, replace(weighted, outlines=None), LOOSE, _places_held, FAR[:6])
     return _judged(state, evidence, weighted, weight)
 
 
@@ -143,15 +143,14 @@ def _best_of_each(best: _Found, found: Sequence[_Found], evidence: Evidence) -> 
     fit = best[1]
     terms, state = evidence.outlines, fit.flashlights
     assert terms is not None
-    albedo = log_albedo(state, evidence, fit.weight)
+    albedo = (evidence.log_grey - log_irradiance(state, evidence) - cell_residuals(state, evidence, fit.weight))[0]
     ground = fit.weight.sum(0) > 0
     cells = (evidence.weight > 0).sum(1) / _alike(evidence)
     costs, trials = [], []
     for one in found:
-        shared = {name: getattr(state, name) for name in ("beam", "ambient", "aim", "response")}
-        trial = replace(one[1].flashlights, **shared)
+        trial = replace(one[1].flashlights, beam=state.beam, ambient=state.ambient, aim=state.aim)
         trial = looked_for_aims(trial, evidence, fit.weight)
-        residual = evidence.log_grey - log_pictured(trial, evidence) - albedo
+        residual = evidence.log_grey - log_irradiance(trial, evidence) - albedo
         misfit = [spread(r[m & ground]) for r, m in zip(residual, evidence.weight > 0, strict=True)]
         moved = np.repeat(state.positions[None], len(cells), 0)
         moved[np.arange(len(cells)), np.arange(len(cells))] = trial.positions
@@ -180,13 +179,50 @@ def _pass(state: Flashlights, evidence: Evidence, misfit: float, blurs: Float[np
     weighted = _weighted(evidence, misfit)
     for blur in blurs:
         blurred = replace(weighted, outlines=replace(evidence.outlines, blur=float(blur)))
-        state = refine(state, blurred, LOOSE, without_wall, FAR[:PER_BLUR])[0]
+        state = refine(state, blurred, LOOSE, _tangent, FAR[:PER_BLUR])[0]
     return _settled(state, evidence, misfit)
 
 
-def settled(start: Flashlights, evidence: Evidence) -> FlashlightFit:
-    """Return the fit to outlines and shading together from places, aims, powers and beam near the answer."""
-    return _settled(start, evidence, _settled(start, evidence, USUAL_MISFIT)[2])[1]
+def at_best_contrast(start: Flashlights, evidence: Evidence, contrasts: Sequence[float] = CONTRASTS) -> FlashlightFit:
+    """Fit to outlines and shading together under the contrast that explains the photos best.
+
+    A phone that evens out brightness over whole regions shows a share of the differences of log brightness that the
+    light makes. Taken for the light's, these place all lights too far away. The share is one number for all photos: its
+    posterior mean is taken, and `between` of the fit holds what other shares would give. The fit that is returned has
+    beam and powers as they are in the pictures.
+
+    Args:
+        start: places, aims, powers and beam near the answer.
+        evidence: with outlines.
+        contrasts: that are tried, one after the other; 1 alone where the photos are linear.
+    """
+    found: list[_Found] = []
+    state, misfit = start, USUAL_MISFIT
+    for number, one in enumerate(contrasts):
+        LOG.info("fitting the lights under contrast %d of %d", number + 1, len(contrasts))
+        found.append(_settled(state, _flattened(evidence, one), misfit))
+        state, misfit = found[-1][1].flashlights, found[-1][2]
+    shown = [(cost, fit, one * misfit) for one, (cost, fit, misfit) in zip(contrasts, found, strict=True)]
+    surprise = np.log(contrasts) / CONTRAST_WIDTH
+    cost = _posteriors(shown, evidence) + 0.5 * surprise**2  # of the misfit in the pictures
+    weight = np.exp(cost.min() - cost)
+    best = float(weight @ contrasts / weight.sum())
+    near = found[int(np.abs(np.array(contrasts) - best).argmin())][1].flashlights
+    fit = _settled(near, _flattened(evidence, best), misfit)[1]
+    places = np.stack([one.flashlights.positions for _, one, _ in found])
+    between = variance_about(np.einsum("f,fkx->kx", weight / weight.sum(), places), places, weight)
+    return _as_pictured(replace(fit, between=between), evidence)
+
+
+def _flattened(evidence: Evidence, contrast: float) -> Evidence:
+    return replace(evidence, log_grey=evidence.log_grey / contrast)
+
+
+def _as_pictured(fit: FlashlightFit, evidence: Evidence) -> FlashlightFit:
+    """Fit beam, aims and powers to the evidence with the places held, so that they say what the pictures show."""
+    weighted = _weighted(evidence, USUAL_MISFIT)
+    flashlights, weight = _held(fit.flashlights.positions, weighted, fit.flashlights)
+    return replace(_judged(flashlights, evidence, weighted, weight)[1], between=fit.between)
 
 
 def _posteriors(found: Sequence[_Found], evidence: Evidence) -> Float[np.ndarray, " found"]:
@@ -208,7 +244,7 @@ def _likeliest(found: Sequence[_Found], evidence: Evidence) -> _Found:
 def _settled(start: Flashlights, evidence: Evidence, misfit: float) -> _Found:
     """Refine a state near the answer; misfit: of the shading, log units, by which its cells are weighted."""
     weighted = _weighted(evidence, misfit)
-    flashlights, weight = refine(start, weighted, LOOSE, without_wall, FAR[:8] + NEAR)
+    flashlights, weight = refine(start, weighted, LOOSE, _tangent, FAR[:8] + NEAR)
     return _judged(flashlights, evidence, weighted, weight)
 
 
@@ -218,7 +254,7 @@ def _judged(flashlights: Flashlights, evidence: Evidence, weighted: Evidence, we
     misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
     return (
         evidence.outlines.cost(flashlights.positions) if (weight > 0).any() else LOST,
-        FlashlightFit(flashlights, _weighted(evidence, misfit), weight, LOOSE, without_wall),
+        FlashlightFit(flashlights, _weighted(evidence, misfit), weight, LOOSE, _tangent),
         misfit,
     )
 
@@ -251,14 +287,29 @@ def _held(
     n, centre = len(places), evidence.cells.centre
     evidence = replace(evidence, outlines=None)
     if like is not None:
-        return refine(replace(like, positions=places), evidence, LOOSE, places_held, FAR[:2] + NEAR)
+        return refine(replace(like, positions=places), evidence, LOOSE, _places_held, FAR[:2] + NEAR)
     beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS + RING_TERMS)]
     state = Flashlights(places, np.repeat(centre[None], n, 0), np.zeros(n), beam, START_AMBIENT, centre)
     for _ in range(AIM_ROUNDS):
-        state, weight = refine(state, evidence, LOOSE, places_held, FAR[:8] + NEAR)
+        state, weight = refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)
         state = looked_for_aims(state, evidence, weight)
-    state, weight = refine(state, evidence, LOOSE, places_held, FAR[:8] + NEAR)
-    return bent(state, evidence), weight
+    return refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)
+
+
+def _tangent(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
+    """Return free_tangent, without the wall where there is none: one is found from near its place only."""
+    basis = free_tangent(flashlights)
+    if flashlights.wall[2] > 0:
+        return basis
+    last = basis.shape[1] - 3  # the mean aim
+    return np.delete(basis, np.arange(last - WALL_TERMS, last), axis=1)
+
+
+def _places_held(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
+    basis = _tangent(flashlights)
+    n, free = len(flashlights.positions), flashlights.per_flashlight() - 1
+    columns = np.arange(basis.shape[1])
+    return basis[:, (columns >= free * n) | (columns % free >= 3)]
 
 
 def looked_for_aims(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> Flashlights:
@@ -268,7 +319,6 @@ def looked_for_aims(flashlights: Flashlights, evidence: Evidence, weight: Sample
         weight: of the samples, as a fit left them: they tell the ground's albedo.
     """
     thin = _without_albedo(flashlights, evidence, weight)
-    middle = float(np.median(log_exposed(flashlights, evidence)))
     targets, power = flashlights.targets.copy(), flashlights.log_power.copy()
     for k in range(len(targets)):
         own = thin.at(thin.weight[k] > 0)
@@ -276,7 +326,7 @@ def looked_for_aims(flashlights: Flashlights, evidence: Evidence, weight: Sample
             continue
         place = flashlights.positions[k]
         trials = np.concatenate([targets[k : k + 1], _trial_targets(flashlights.aim, place)])
-        size, offset = _misfits(flashlights, own, k, place, trials, middle)
+        size, offset = _misfits(flashlights, own, k, place, trials)
         best = int(np.argmin(size))
         if size[best] < CLEARLY * size[0]:
             targets[k], power[k] = trials[best], offset[best]
@@ -285,9 +335,11 @@ def looked_for_aims(flashlights: Flashlights, evidence: Evidence, weight: Sample
 
 def _without_albedo(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> Evidence:
     """Return every third cell of those that follow the light, its log albedo taken out of its brightness."""
+    residuals = cell_residuals(flashlights, evidence, weight)
+    level = (evidence.log_grey - log_irradiance(flashlights, evidence) - residuals)[0]
     some = np.flatnonzero(weight.sum(0) > 0)[::EVERY]
     thin = evidence.at(some)
-    return replace(thin, log_grey=thin.log_grey - log_albedo(flashlights, evidence, weight)[some])
+    return replace(thin, log_grey=thin.log_grey - level[some])
 
 
 def _misfits(
@@ -296,18 +348,15 @@ def _misfits(
     k: int,
     place: Float[np.ndarray, "3"],
     targets: Float[np.ndarray, "trials 3"],
-    middle: float,
 ):
     """Return what `misfits` does of photo k, its light in one place and aimed at each target.
 
     Args:
         own: of the cells that photo k shows, without albedo.
-        middle: median of log_exposed of all photos.
     """
     n = len(targets)
     state = replace(flashlights, positions=np.repeat(place[None], n, 0), targets=targets, log_power=np.zeros(n))
-    own = replace(own, exposure=None if own.exposure is None else np.repeat(own.exposure[k], n))
-    return misfits(own.log_grey[k] - log_pictured(state, own, middle), float(np.median(flashlights.log_power)))
+    return misfits(own.log_grey[k] - log_irradiance(state, own), float(np.median(flashlights.log_power)))
 
 
 def _trial_targets(aim: Float[np.ndarray, "3"], place: Float[np.ndarray, "3"]) -> Float[np.ndarray, "trials 3"]:

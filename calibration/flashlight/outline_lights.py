@@ -18,13 +18,12 @@ from calibration.flashlight.fit import (
     FlashlightFit,
     does_not_follow,
 )
-from calibration.flashlight.joint_search import searched, settled
+from calibration.flashlight.joint_search import CONTRASTS, at_best_contrast, searched
 from calibration.flashlight.model import (
     Evidence,
     Flashlights,
     normal_equations,
 )
-from calibration.flashlight.pictured import bent
 from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows, find_shadows, of_one_ground
 from calibration.ground.mirror_highlights import find_highlights
@@ -72,7 +71,7 @@ def with_outlines(
     if terms is None:
         return None
     starts = [*shadow_starts(terms.maps, shadows.object_mask, posed_camera), by_shading.positions]
-    cells = replace(_lit_cells(evidence, shadows, posed_camera), outlines=terms, exposure=None)
+    cells = replace(_lit_cells(evidence, shadows, posed_camera), outlines=terms)
     fit = searched(starts, cells)
     wide = _terms(coarse, field, shadows, posed_camera, cues, True) if _at_odds(fit, terms) > OUTLINES_WRONG else None
     if wide is not None and _at_odds(fit, wide) < REPAIRED * _at_odds(fit, terms):
@@ -81,9 +80,9 @@ def with_outlines(
     if _ground(fit) < MIN_GROUND / THIN:
         return None
     # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share
-    agreeing = replace(cells, outlines=replace(terms, trusted=~_contradicts(fit)), exposure=evidence.exposure)
-    found = replace(settled(bent(fit.flashlights, agreeing), agreeing), between=fit.between)
-    return found if _ground(found) >= MIN_GROUND / THIN else None
+    agreeing = replace(cells, outlines=replace(terms, trusted=~_contradicts(fit)))
+    found = at_best_contrast(fit.flashlights, agreeing, (1.0,) if stack.is_linear else CONTRASTS)
+    return replace(found, between=found.between + fit.between) if _ground(found) >= MIN_GROUND / THIN else None
 
 
 def outlines_of(

@@ -8,6 +8,9 @@ The stated error of a light is made of lengths that its own photo and the fit sh
 - power: a flashlight has one power. Where the fitted powers differ, distances are wrong instead: light falls with the
   distance squared, so half of a light's own log power, and of the spread of all, is a share of its distance. A photo
   that was exposed otherwise counts only up to where the fit takes it for one;
+- beam: a beam may have a hot centre and rings, which a smooth one cannot follow: it moves all lights together, and each
+  photo's residuals stay small. How far the lights move when the beam gets splines tells. Counted where the shading of
+  most photos places no light surely; elsewhere the beam is smooth, as the other errors show;
 - starts: fits from other starts that explain a few cells about as well lie elsewhere (fit.FirstFits);
 - what no residual shows: a small share of the distance.
 
@@ -20,8 +23,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.sparse import csr_array
 
+from calibration.flashlight.beam_profile import RING_TERMS
 from calibration.flashlight.descent import refine
-from calibration.flashlight.fit import LAST, OVAL_PHOTOS, FlashlightFit
+from calibration.flashlight.fit import FAR, LAST, NEAR, OVAL_PHOTOS, FlashlightFit
 from calibration.flashlight.model import NOISE, normal_equations
 from capture.checks.mixture import STEADY, levels
 from capture.checks.robust import spread
@@ -29,6 +33,7 @@ from capture.checks.robust import spread
 QUADRANTS = 4
 SPENT_PHOTOS = 3  # that the albedo of the ground and what all beams share take up: few photos hide their own errors
 DOUBTFUL = 1.5  # times the spread over the quadrants, in the verdict whether a light is used
+BEAM_STEPS = 2.0  # errors of lights over how far splines move them, on rendered captures: 1.3 to 2
 HONEST_SHARE = 0.0035  # of the range: what no residual shows
 FEW_SHARE = 0.02  # of the range, with too few photos to see whether the beam is round: as 2 % of asymmetry costs
 
@@ -64,3 +69,11 @@ def unseen_error(fit: FlashlightFit) -> Float[np.ndarray, " photos"]:
     own = fit.flashlights.log_power - levels(fit.flashlights.log_power, STEADY)
     by_power = 0.5 * np.hypot(np.minimum(np.abs(own), fit.priors.power_outlier), spread(own))
     return np.hypot(HONEST_SHARE if len(reach) >= OVAL_PHOTOS else FEW_SHARE, by_power) * reach
+
+
+def beam_error(fit: FlashlightFit) -> Float[np.ndarray, " photos"]:
+    """Return the position error (world unit) of a smooth beam's fit if the beam has a hot centre and rings."""
+    beam = np.r_[fit.flashlights.beam, np.zeros(RING_TERMS)]
+    start = replace(fit.flashlights, beam=beam)
+    found, _ = refine(start, fit.evidence, fit.priors, fit.tangent, FAR[:8] + NEAR)
+    return BEAM_STEPS * np.linalg.norm(found.positions - fit.flashlights.positions, axis=1)
