@@ -60,7 +60,7 @@ def visited(run: Path) -> int:
         page.refresh()
     for index in range(min(8, len(page._lights))):
         page.choose_photo(index)
-    shown = [page.controls.status_html(), *(str(getattr(h, "content", "")) for h in _handles(server))]
+    shown = [page.controls._status.content, *(str(getattr(h, "content", "")) for h in _handles(server))]
     server.stop()
     if any("<script>alert" in text or "<img src=x" in text for text in shown):
         raise RuntimeError("text of the folder became markup of the page")
@@ -86,7 +86,7 @@ def listed(run: Path) -> int:
     folder = StudioFolder(run.parent)
     queue = Queue(run.parent / "out.json")
     parts, helper = Parts(folder.kept / "parts", folder.root), Helper(folder.kept / "looks.txt")  # which is not started
-    library = Library(folder, queue, parts, Checks(folder.kept / "checks", helper))
+    library = Library(folder, queue, parts, Checks(folder.kept / "checks", helper, ()))
     text = json.dumps(library.cards(), allow_nan=False)
     assert text.encode()
     return 0
