@@ -21,6 +21,7 @@ from capture.files.regular import open_regular
 
 LARGEST_FILE = 4 << 30  # bytes
 LARGEST_HEADER = 1 << 20  # bytes; ours have some 2000
+MOST_TENSORS = 4096
 METADATA = "__metadata__"  # key of the text in the header
 
 
@@ -102,6 +103,8 @@ def parsed(header: Mapping[str, str], key: str) -> Any:
 
 
 def _check(tensors: Mapping[str, Tensor], layouts: Mapping[str, Layout] | None, most_numbers: int | None) -> None:
+    if len(tensors) > MOST_TENSORS:
+        raise ValueError(f"{len(tensors)} tensors were found, at most {MOST_TENSORS} were needed")
     for name, layout in (layouts or {}).items():
         if layout.is_needed and name not in tensors:
             raise ValueError(f"the tensor {name!r} is missing")

@@ -207,10 +207,8 @@ def _motions(
     if not near or len(indices) < FEWEST_PHOTOS:
         return {}, None
     height, width = stack.rgb.shape[1:3]
-    home, rotation = (
-        home_view(stack, indices, board),
-        Rotation(focal_in_pixels(stack.focal_35mm, width, height), width, height),
-    )
+    home = home_view(stack, indices, board)
+    rotation = Rotation(focal_in_pixels(stack.focal_35mm, width, height), width, height)
     turns = {i: _own_angles(home, k, rotation) for k, i in enumerate(indices) if stack.paths[i] in off}
     own = {i: rotation.homography(one) for i, one in _shared(turns, rotation.focal, home).items()}
     own = {i: motion for i, motion in own.items() if _shift_of(motion, stack) <= farthest}

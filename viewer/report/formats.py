@@ -8,8 +8,7 @@ PAGE = Format(
     "One file: the light follows the pointer, no server is needed.",
     "viewer.stage.page:write_page",
 )
-OTHERS = {name: FORMATS.pop(name) for name in list(FORMATS)}
-for name, row in OTHERS.items():
-    FORMATS[name] = row
-    if name == "3mf":  # behind which a person looks for it
-        FORMATS["html"] = PAGE
+_rows = list(FORMATS.items())
+_rows.insert(list(FORMATS).index("3mf") + 1, ("html", PAGE))  # behind which a person looks for it
+FORMATS.clear()
+FORMATS.update(_rows)
