@@ -105,7 +105,8 @@ NAME = """() => { const one = document.activeElement;
 def press_until(tab, words: str, frame=None) -> None:
     """Tab on until the element of this name has the focus; each on the way shows that it has it.
 
-    A page has handled a key when `press` returns; a frame, which is a process of its own, handles it when it has time.
+    A page has handled a key when `press` returns; a frame, which is a process of its own, handles it when it has time,
+    and takes the focus only then: until it has it, the page's body has it.
     """
     place, passed = frame or tab, []
     for _ in range(60):
@@ -113,6 +114,11 @@ def press_until(tab, words: str, frame=None) -> None:
         tab.keyboard.press("Tab")
         if frame:
             wait_until(tab, lambda: frame.evaluate("document.activeElement !== window.had"))
+        else:
+            for _ in range(100):  # not for ever: a page drawn anew may have lost what had the focus
+                if tab.evaluate("document.activeElement !== document.body"):
+                    break
+                tab.wait_for_timeout(100)
         passed.append(place.evaluate(NAME))
         assert place.evaluate(SEEN), f"nobody sees that {passed[-1]} has the focus"
         if words in passed[-1]:
