@@ -1,16 +1,18 @@
 """Write tensors to safetensors files, and read them from those of strangers.
 
-The library checks the header against the file's size before it hands out a tensor. The file is read, not mapped into
-memory: cutting a mapped file would end the program.
+What the header states is checked before the rest is read, and by the library against the file's size. The file is read,
+not mapped into memory: cutting a mapped file would end the program.
 """
 
 import json
+import math
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save_file
@@ -23,6 +25,16 @@ LARGEST_FILE = 4 << 30  # bytes
 LARGEST_HEADER = 1 << 20  # bytes; ours have some 2000
 MOST_TENSORS = 4096
 METADATA = "__metadata__"  # key of the text in the header
+KINDS = {
+    "F64": torch.float64,
+    "F32": torch.float32,
+    "F16": torch.float16,
+    "I64": torch.int64,
+    "I32": torch.int32,
+    "I16": torch.int16,
+    "U8": torch.uint8,
+    "BOOL": torch.bool,
+}
 
 
 @dataclass(frozen=True)
@@ -60,15 +72,37 @@ def read_tensors(
         length = int.from_bytes(file.read(8), "little")
         if length > min(LARGEST_HEADER, size - 8):
             raise ValueError(f"a header of {length} bytes was stated in a file of {size} bytes")
+        header = parse_json(file.read(length).decode())
+        texts = header.pop(METADATA, {}) if isinstance(header, dict) else {}
+        stated = _stated(header)
+        _check(stated, layouts, most_numbers)
+        most = 8 + length + sum(tensor.nbytes for tensor in stated.values())
         file.seek(0)
-        content = file.read()
+        content = file.read(most + 1)
     try:
         tensors = load(content)
-    except (SafetensorError, KeyError) as error:  # KeyError: numbers of a type that torch has not
+    except SafetensorError as error:
         raise ValueError(str(error)) from error
-    _check(tensors, layouts, most_numbers)
-    header = parse_json(content[8 : 8 + length].decode()).get(METADATA, {})
-    return StoredTensors({name: tensors[name] for name in sorted(tensors)}, header)
+    return StoredTensors({name: tensors[name] for name in sorted(stated)}, texts)
+
+
+class _Entry(msgspec.Struct):
+    """What a header states of one tensor."""
+
+    dtype: Annotated[str, msgspec.Meta(pattern=rf"^({'|'.join(KINDS)})$")]
+    shape: list[Annotated[int, msgspec.Meta(ge=0, le=LARGEST_FILE)]]
+
+
+def _stated(header: Any) -> dict[str, Tensor]:
+    """Return what a header states as tensors without content."""
+    try:
+        entries = msgspec.convert(header, dict[str, _Entry])
+    except msgspec.ValidationError as error:
+        raise ValueError(f"its header is damaged: {error}") from error
+    for name, entry in entries.items():
+        if math.prod(entry.shape) > LARGEST_FILE:
+            raise ValueError(f"the tensor {name[:40]!r} of {entry.shape} fits into no file of {LARGEST_FILE} bytes")
+    return {name: torch.empty(e.shape, dtype=KINDS[e.dtype], device="meta") for name, e in entries.items()}
 
 
 def write_tensors(tensors: Mapping[str, Tensor], texts: Mapping[str, str], path: Path) -> None:

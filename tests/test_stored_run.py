@@ -25,6 +25,7 @@ from safetensors.torch import load
 import shadowgraph
 from capture.errors import UserError
 from capture.files.atomic import atomic_file
+from reconstruct import tensor_file
 from reconstruct.export.export import export
 from reconstruct.fields import load_fields
 from reconstruct.mesh.mesh import vertex_colours
@@ -32,7 +33,7 @@ from reconstruct.run.bundle import write_bundle
 from reconstruct.stored_run.maps import read_thumbnail
 from reconstruct.stored_run.ply import read_mesh
 from reconstruct.stored_run.stored_run import StoredRun
-from reconstruct.tensor_file import read_tensors
+from reconstruct.tensor_file import Layout, read_tensors, write_tensors
 from viewer.display.run_follower import RunFollower, status
 from viewer.report.report import read_results, write_report
 from viewer.stage.pack_file import stored_stage
@@ -123,6 +124,21 @@ def test_a_file_of_tensors_is_in_memory_and_not_mapped_so_that_cutting_it_later_
     assert stored.keys() == expected.keys()
     assert all(torch.equal(stored[name], expected[name]) for name in expected)
     with pytest.raises(ValueError, match="a header of"):
+        read_tensors(path)
+
+
+def test_of_a_file_that_states_other_tensors_than_are_needed_nothing_but_the_header_is_read(run, monkeypatch):
+    path = run / "fields.safetensors"
+    write_tensors({"sdf": torch.zeros(1 << 20)}, {}, path)
+    monkeypatch.setattr(tensor_file, "load", lambda content: pytest.fail("its content was read"))
+    for layout in (Layout(torch.float32, (None, None)), Layout(torch.float16, (None,))):
+        with pytest.raises(ValueError, match=r"'sdf' is torch.float32 \[1048576\]"):
+            read_tensors(path, {"sdf": layout})
+    with pytest.raises(ValueError, match="at most 1000 can be read"):
+        read_tensors(path, most_numbers=1000)
+    header = json.dumps({"sdf": {"dtype": "F32", "shape": [1 << 31, 1 << 31], "data_offsets": [0, 4]}}).encode()
+    path.write_bytes(len(header).to_bytes(8, "little") + header + bytes(4))
+    with pytest.raises(ValueError, match="fits into no file"):
         read_tensors(path)
 
 
