@@ -4,7 +4,7 @@ import numpy as np
 
 from calibration.flashlight import joint_search, model
 from calibration.flashlight.beam_profile import (
-    RING_STEP,
+    RING_SPAN,
     RING_TERMS,
     SMOOTH_TERMS,
     derivatives,
@@ -82,12 +82,12 @@ def test_derivatives_of_the_profile_are_those_of_differences():
     cosine, step = draw.uniform(0.3, 0.999, (2, 50)), 1e-5
     by_cosine, by_term = derivatives(cosine, beam)
     across = (log_gain(cosine + step, beam) - log_gain(cosine - step, beam)) / (2 * step)
-    assert np.median(np.abs(by_cosine - across)) < 0.05  # the profile is tabulated
+    assert np.median(np.abs(by_cosine - across)) < 0.2  # of slopes of 30: the profile is tabulated
     one = np.eye(len(beam))[SMOOTH_TERMS + 5] * 0.1
     np.testing.assert_allclose(
         0.1 * by_term[..., SMOOTH_TERMS + 5], log_gain(cosine, beam + one) - log_gain(cosine, beam), atol=1e-4
     )
-    inside = by_term[..., SMOOTH_TERMS:].sum(-1)[(cosine > 0.6) & (cosine < 1 - RING_STEP)]
+    inside = by_term[..., SMOOTH_TERMS:].sum(-1)[(cosine > 0.6) & (cosine < 1 - RING_SPAN / RING_TERMS)]
     np.testing.assert_allclose(inside, 1, atol=1e-12)  # B-splines are a partition of unity
 
 

@@ -121,6 +121,6 @@ def test_fits_are_compared_by_the_cells_that_they_are_fitted_to(ball):
     fit = FlashlightFit(state, evidence, evidence.weight, joint_search.LOOSE, free_tangent)
     for misfit in (0.3, 2.0, 4.0):  # of noise
         found = [(0.0, fit, misfit * joint_search.NOISE), (1.5, fit, 1.1 * misfit * joint_search.NOISE)]
-        cells = (evidence.weight > 0).sum() / joint_search._alike(evidence)
+        cells = (evidence.weight > 0).sum() / joint_search.alike(evidence.weight)
         gap = np.diff(joint_search._posteriors(found, evidence))
         np.testing.assert_allclose(gap, 1.5 + cells * np.log(1.1), rtol=1e-9)

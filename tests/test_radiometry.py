@@ -1,16 +1,11 @@
 from dataclasses import replace
 
-import flashlight_photos
 import lit_table
 import numpy as np
 import pytest
 
-from calibration.flashlight.fit import collect, first_guess, fit_flashlights
-from calibration.flashlight.light_estimate import free_tangent, locate_lights
-from calibration.flashlight.tone_curve import OTHER_CURVES, ToneTest, compare_curves
 from capture.checks.check_stack import white_balance_finding
 from capture.errors import CaptureError
-from capture.photos.photo import decode_srgb
 from capture.photos.radiometry import white_balance, with_one_white_balance, without_ambient
 
 N = 10
@@ -64,54 +59,3 @@ def test_colours_that_cancel_over_the_picture_are_no_white_balance_and_change_no
     balance = white_balance(replace(stack, rgb=rgb))
     assert np.log(balance).sum(1) == pytest.approx(np.zeros(N), abs=1e-6)
     assert balance[4] == pytest.approx(np.ones(3), abs=0.01)
-
-
-# --- the tone curve --------------------------------------------------------------------------------------------------
-
-
-def on_bt709(linear):
-    """Files encoded by BT.709, read as if they were sRGB."""
-    low = np.maximum(linear, 1e-9)
-    encoded = np.where(linear < 0.018, 4.5 * linear, 1.099 * low**0.45 - 0.099)
-    return decode_srgb(encoded.astype(np.float32))
-
-
-@pytest.mark.slow  # two fits, one of which asks the shadows' outlines; what is said of them is tested below
-def test_files_on_another_curve_than_srgb_raise_doubt(monkeypatch):
-    truth = flashlight_photos.photograph(flashlight_photos.Recipe(n_photos=10))
-    stack = replace(truth.stack, rgb=on_bt709(truth.stack.rgb))
-    place = (flashlight_photos.POSED_CAMERA, np.ones(10, bool))
-    found = locate_lights(stack, *place)
-    assert "fits BT.709 better than the sRGB curve" in found.residuals["tone"]["doubt"]
-    assert np.median(truth.errors(found.lights)) > 0.01
-    assert truth.share_inside(found.lights) > 0.9  # the doubt is in the stated uncertainty
-    right = locate_lights(truth.stack, *place)
-    assert right.residuals["tone"]["doubt"] == ""
-    assert np.median([np.linalg.norm(light.sigma) for light in right.lights]) < 5  # mm
-
-
-def test_files_on_the_curve_of_bt709_are_decoded_to_the_light_that_made_them():
-    linear = np.array([0.002, 0.01, 0.017, 0.02, 0.1, 0.5, 0.95], np.float32)
-    np.testing.assert_allclose(OTHER_CURVES["BT.709"](on_bt709(linear)), linear, rtol=2e-3)
-
-
-def test_nothing_is_said_against_srgb_unless_another_curve_is_clearly_better():
-    shown = {"sRGB": 0.0020, "BT.709": 0.0018, "a steeper curve": 0.0021, "a flatter curve": 0.0022}
-    found = ToneTest(shown, np.array([10.0, 20.0]), np.array([3.0, 4.0]))
-    assert found.best() == "sRGB" and found.sentence() == "" and found.document()["residuals"] == shown
-    np.testing.assert_allclose(found.error(), [5.0, 10.0])  # half of the way between a hint and a clear answer
-    moved = found.moved, found.moved_flatter
-    assert not ToneTest(shown | {"BT.709": 0.00191}, *moved).error().any()
-    flatter = ToneTest(shown | {"BT.709": 0.0022, "a flatter curve": 0.0021}, *moved)
-    np.testing.assert_allclose(flatter.error(), [1.5, 2.0])  # true sRGB fits worse by more when it is decoded flatter
-
-
-def test_of_linear_photos_no_curve_is_doubted_and_no_light_less_certain():
-    truth = flashlight_photos.photograph(flashlight_photos.Recipe(n_photos=6))
-    evidence, _ = collect(
-        replace(truth.stack, rgb=on_bt709(truth.stack.rgb)), flashlight_photos.POSED_CAMERA, np.ones(6, bool)
-    )
-    fit = fit_flashlights(first_guess(evidence), evidence, free_tangent)
-    assert compare_curves(fit, np.ones(6), is_linear=False).error().any()
-    found = compare_curves(fit, np.ones(6), is_linear=True)
-    assert list(found.residuals) == ["linear"] and found.sentence() == "" and not found.error().any()

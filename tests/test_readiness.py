@@ -18,7 +18,7 @@ from capture.photos.finding import Finding
 from reconstruct.check import verdict as readiness
 from reconstruct.check.light_coverage import from_the_camera, shadow_cover, side_in_words
 from reconstruct.check.readiness import judge, refuse_hopeless
-from reconstruct.check.verdict import CaptureCheck, tone_doubts
+from reconstruct.check.verdict import CaptureCheck
 from reconstruct.source.photos import Photos
 from reconstruct.source.source import RunOptions, Source
 from viewer.report.check_page import (
@@ -170,12 +170,6 @@ def test_doubts_and_dropped_photos_are_reasons(truth, cover):
     found = judge(replace(truth.calibration, lights=lights), findings, cover, ("the tone curve is doubtful",))
     assert "17 of 26 photos can be used (blurred: 9)" in found.reasons
     assert "the tone curve is doubtful" in found.reasons
-
-
-def test_a_doubtful_tone_curve_is_said(truth):
-    doubted = replace(truth.calibration, residuals={"tone": {"doubt": "tone curve: BT.709 fits better"}})
-    assert tone_doubts(doubted) == ("tone curve: BT.709 fits better",)
-    assert tone_doubts(truth.calibration) == ()
 
 
 def test_the_page_and_the_terminal_say_it_all(truth, cover, tmp_path):

@@ -14,8 +14,9 @@ from calibration.light import log_beam_gain
 
 EXTRA_TERMS = 3  # r2, r3, r4: fewer cannot follow a real beam (position errors of 2-6 % with none)
 SMOOTH_TERMS = 1 + EXTRA_TERMS  # what comes after these are splines
-RING_TERMS = 16  # up to 64 degrees off the axis
-RING_STEP = 0.035  # of u from one spline to the next: 4 degrees at 30 degrees, where LEDs have rings
+RING_SPAN = 0.56  # of u that splines cover: up to 64 degrees off the axis
+RING_TERMS = 32  # 2 degrees apart at 30 degrees, where LEDs have rings
+BROAD_TERMS = 16  # 4 degrees apart, where outlines are fitted with the brightness: it has fewer cells there
 PROFILE = 2000  # places at which the splines' sum is tabulated
 
 Samples = Float[np.ndarray, "*batch"]
@@ -81,15 +82,16 @@ def _smooth_terms(cosine: Samples, count: int) -> Float[np.ndarray, "*batch term
 
 
 def _splines(u: Samples, count: int) -> tuple[Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n"]]:
-    """Return cubic B-splines of u, their middles RING_STEP apart from u = 0 on, and their derivatives by u.
+    """Return cubic B-splines of u, their middles equally far apart from u = 0 on, and their derivatives by u.
 
     See de Boor, A Practical Guide to Splines (1978).
     """
-    x = u / RING_STEP
+    step = RING_SPAN / count
+    x = u / step
     first = x.astype(np.int64)
     t = x - first
     value = np.stack([(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, 3 * (t + t**2 - t**3) + 1, t**3], -1) / 6
-    slope = np.stack([-((1 - t) ** 2), 3 * t**2 - 4 * t, 1 + 2 * t - 3 * t**2, t**2], -1) / (2 * RING_STEP)
+    slope = np.stack([-((1 - t) ** 2), 3 * t**2 - 4 * t, 1 + 2 * t - 3 * t**2, t**2], -1) / (2 * step)
     place = np.clip(first[..., None] + np.arange(4), 0, count + 3)  # shifted by one, and three more beyond the last
     out = np.zeros((2, *u.shape, count + 4))
     np.put_along_axis(out[0], place, value, -1)

@@ -59,6 +59,7 @@ DIRECTIONS = np.concatenate(  # of a hemisphere, 15 degrees apart: unit vectors
     ]
 )
 OVAL_GAIN = 0.85  # of the residual: round beams keep 0.98, beams with 2 % of asymmetry at 40 degrees go to 0.5
+TELLS = 12.0  # independent numbers of a photo's ground: 50 by the correlation within it, and photos err alike
 OVAL_PHOTOS = 8  # fewer leave the ground's albedo free enough to take the terms up
 
 
@@ -123,7 +124,9 @@ def collect(
             "(25 or more are better). Take more photos with the flashlight in different places."
         )
     cells = sample_ground(stack, posed_camera, photos)
-    evidence = Evidence.of(cells, np.array(stack.gains)[photos], posed_camera.ground_height)
+    gains = np.array(stack.gains)[photos]
+    evidence = Evidence.of(cells, gains, posed_camera.ground_height)
+    evidence = replace(evidence, exposure=None if stack.is_linear else np.log(gains))
     refuse_still_light(evidence)
     return evidence, photos
 
@@ -147,7 +150,7 @@ def misfits(residual: Float[np.ndarray, "trials cells"], common: float | None):
     return size, offset
 
 
-def _thinned(evidence: Evidence) -> Evidence:
+def thinned(evidence: Evidence) -> Evidence:
     """Return at most FEW_CELLS of the cells that are known in most photos: enough for a search."""
     known = np.flatnonzero((evidence.weight > 0).mean(0) > 0.5)
     if len(known) < MIN_GROUND:
@@ -164,7 +167,7 @@ def first_fits(evidence: Evidence) -> FirstFits:
     Raises:
         CalibrationError: too little ground is usable in most photos.
     """
-    thin = _thinned(evidence)
+    thin = thinned(evidence)
     starts = []
     for beam in START_BEAMS:
         for distance in hand.DISTANCES[1:-1]:
@@ -174,8 +177,7 @@ def first_fits(evidence: Evidence) -> FirstFits:
     found = [refine(state, thin, ALIKE_POWER, free_tangent, FAR[8:] + NEAR) for _, _, state in better]
     costs = np.array([cost(state, thin, weight, ALIKE_POWER) for state, weight in found])
     best, weight = found[int(costs.argmin())]
-    independent = weight.sum() / evidence.weight.max() / design_effect(cell_residuals(best, thin, weight), weight, thin)
-    return FirstFits(tuple(state for state, _ in found), costs, max(independent, 1.0))
+    return FirstFits(tuple(state for state, _ in found), costs, independent(best, weight, thin))
 
 
 def first_guess(evidence: Evidence) -> Flashlights:
@@ -212,6 +214,18 @@ def _on_sphere(evidence: Evidence, distance: float, beam: float) -> Flashlights:
         power = np.array([offset[k] for (_, offset), k in zip(best, index, strict=True)])
         shown = table[index] + power[:, None]
     return state(places[index])
+
+
+def independent(state: Flashlights, weight: Samples, evidence: Evidence) -> float:
+    """Return how many of a fit's weighted samples err independently."""
+    effect = design_effect(cell_residuals(state, evidence, weight), weight, evidence)
+    return max(float(weight.sum() / evidence.weight.max()) / effect, 1.0)
+
+
+def alike(weight: Samples) -> float:
+    """Return how many of a photo's weighted ground cells are wrong together."""
+    cells = (weight > 0).sum(1)
+    return max(float(np.median(cells[cells > 0])) / TELLS, 1.0) if cells.any() else 1.0
 
 
 def design_effect(residual: Samples, weight: Samples, evidence: Evidence) -> float:

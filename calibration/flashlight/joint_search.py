@@ -11,9 +11,18 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from calibration.flashlight.beam_profile import EXTRA_TERMS, RING_TERMS
+from calibration.flashlight.beam_profile import BROAD_TERMS, EXTRA_TERMS
 from calibration.flashlight.descent import refine
-from calibration.flashlight.fit import FAR, NEAR, START_AMBIENT, START_BEAM, FlashlightFit, misfits, variance_about
+from calibration.flashlight.fit import (
+    FAR,
+    NEAR,
+    START_AMBIENT,
+    START_BEAM,
+    FlashlightFit,
+    alike,
+    misfits,
+    variance_about,
+)
 from calibration.flashlight.model import (
     LAMP,
     NOISE,
@@ -23,9 +32,9 @@ from calibration.flashlight.model import (
     Samples,
     across,
     cell_residuals,
-    free_tangent,
     log_irradiance,
 )
+from calibration.flashlight.pictured import places_held, without_wall
 from calibration.flashlight.wall import NO_WALL, WALL_TERMS, Wall
 from calibration.lights import hand
 from capture.checks.robust import spread
@@ -43,7 +52,6 @@ PER_BLUR = 3  # steps with each
 NO_GROUND = 1e-6  # log units: a misfit of less is that of no cell
 LOST = 1e9  # the cost of lights that no ground follows
 SCATTER = 30.0  # of the negative log posterior between searches by other steps: it has many small minima
-TELLS = 12.0  # independent numbers of a photo's ground: 50 by the correlation within it, and photos err alike
 FARTHER = (0.5, 0.6, 0.72, 0.85, 1.18, 1.4, 1.65, 2.0)  # along what outlines leave free: a hand's range
 ROUNDS = 3  # of other walls and distances, at most
 TRIED = 4  # of a round's: those that are fitted
@@ -113,7 +121,7 @@ def _shaded(like: _Found, places: Float[np.ndarray, "photos 3"], wall: Wall, evi
     """Return the state with such places and wall whose beam, aims and powers shade the ground best."""
     state = replace(like[1].flashlights, positions=places, wall=wall)
     weighted = _weighted(evidence, USUAL_MISFIT)
-    state, weight = refine(state, replace(weighted, outlines=None), LOOSE, _places_held, FAR[:6])
+    state, weight = refine(state, replace(weighted, outlines=None), LOOSE, places_held, FAR[:6])
     return _judged(state, evidence, weighted, weight)
 
 
@@ -145,7 +153,7 @@ def _best_of_each(best: _Found, found: Sequence[_Found], evidence: Evidence) -> 
     assert terms is not None
     albedo = (evidence.log_grey - log_irradiance(state, evidence) - cell_residuals(state, evidence, fit.weight))[0]
     ground = fit.weight.sum(0) > 0
-    cells = (evidence.weight > 0).sum(1) / _alike(evidence)
+    cells = (evidence.weight > 0).sum(1) / alike(evidence.weight)
     costs, trials = [], []
     for one in found:
         trial = replace(one[1].flashlights, beam=state.beam, ambient=state.ambient, aim=state.aim)
@@ -179,7 +187,7 @@ def _pass(state: Flashlights, evidence: Evidence, misfit: float, blurs: Float[np
     weighted = _weighted(evidence, misfit)
     for blur in blurs:
         blurred = replace(weighted, outlines=replace(evidence.outlines, blur=float(blur)))
-        state = refine(state, blurred, LOOSE, _tangent, FAR[:PER_BLUR])[0]
+        state = refine(state, blurred, LOOSE, without_wall, FAR[:PER_BLUR])[0]
     return _settled(state, evidence, misfit)
 
 
@@ -232,7 +240,7 @@ def _posteriors(found: Sequence[_Found], evidence: Evidence) -> Float[np.ndarray
     wall pays for its terms [Schwarz, Estimating the Dimension of a Model, Annals of Statistics 6 (1978)].
     """
     misfit = np.maximum([one[2] for one in found], NO_GROUND)
-    cells = (evidence.weight > 0).sum() / _alike(evidence)
+    cells = (evidence.weight > 0).sum() / alike(evidence.weight)
     walls = np.array([one[1].flashlights.wall[2] > 0 for one in found])
     return np.array([one[0] for one in found]) + cells * np.log(misfit) + walls * WALL_TERMS / 2 * np.log(cells)
 
@@ -244,7 +252,7 @@ def _likeliest(found: Sequence[_Found], evidence: Evidence) -> _Found:
 def _settled(start: Flashlights, evidence: Evidence, misfit: float) -> _Found:
     """Refine a state near the answer; misfit: of the shading, log units, by which its cells are weighted."""
     weighted = _weighted(evidence, misfit)
-    flashlights, weight = refine(start, weighted, LOOSE, _tangent, FAR[:8] + NEAR)
+    flashlights, weight = refine(start, weighted, LOOSE, without_wall, FAR[:8] + NEAR)
     return _judged(flashlights, evidence, weighted, weight)
 
 
@@ -254,7 +262,7 @@ def _judged(flashlights: Flashlights, evidence: Evidence, weighted: Evidence, we
     misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
     return (
         evidence.outlines.cost(flashlights.positions) if (weight > 0).any() else LOST,
-        FlashlightFit(flashlights, _weighted(evidence, misfit), weight, LOOSE, _tangent),
+        FlashlightFit(flashlights, _weighted(evidence, misfit), weight, LOOSE, without_wall),
         misfit,
     )
 
@@ -267,14 +275,8 @@ def _trusted(evidence: Evidence) -> Evidence:
 
 def _weighted(evidence: Evidence, misfit: float) -> Evidence:
     """Weight all photos' cells as their misfit (log units) and their likeness allow."""
-    trust = (NOISE / max(misfit, NOISE)) ** 2 / _alike(evidence)
+    trust = (NOISE / max(misfit, NOISE)) ** 2 / alike(evidence.weight)
     return replace(evidence, weight=evidence.weight * trust)
-
-
-def _alike(evidence: Evidence) -> float:
-    """Return how many ground cells are wrong together."""
-    cells = (evidence.weight > 0).sum(1)
-    return max(float(np.median(cells[cells > 0])) / TELLS, 1.0) if cells.any() else 1.0
 
 
 def _held(
@@ -287,29 +289,13 @@ def _held(
     n, centre = len(places), evidence.cells.centre
     evidence = replace(evidence, outlines=None)
     if like is not None:
-        return refine(replace(like, positions=places), evidence, LOOSE, _places_held, FAR[:2] + NEAR)
-    beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS + RING_TERMS)]
+        return refine(replace(like, positions=places), evidence, LOOSE, places_held, FAR[:2] + NEAR)
+    beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS + BROAD_TERMS)]
     state = Flashlights(places, np.repeat(centre[None], n, 0), np.zeros(n), beam, START_AMBIENT, centre)
     for _ in range(AIM_ROUNDS):
-        state, weight = refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)
+        state, weight = refine(state, evidence, LOOSE, places_held, FAR[:8] + NEAR)
         state = looked_for_aims(state, evidence, weight)
-    return refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)
-
-
-def _tangent(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
-    """Return free_tangent, without the wall where there is none: one is found from near its place only."""
-    basis = free_tangent(flashlights)
-    if flashlights.wall[2] > 0:
-        return basis
-    last = basis.shape[1] - 3  # the mean aim
-    return np.delete(basis, np.arange(last - WALL_TERMS, last), axis=1)
-
-
-def _places_held(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
-    basis = _tangent(flashlights)
-    n, free = len(flashlights.positions), flashlights.per_flashlight() - 1
-    columns = np.arange(basis.shape[1])
-    return basis[:, (columns >= free * n) | (columns % free >= 3)]
+    return refine(state, evidence, LOOSE, places_held, FAR[:8] + NEAR)
 
 
 def looked_for_aims(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> Flashlights:

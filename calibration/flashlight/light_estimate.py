@@ -27,8 +27,8 @@ from calibration.flashlight.fit import (
 )
 from calibration.flashlight.model import Flashlights, Priors, cosines, free_tangent, log_irradiance
 from calibration.flashlight.outline_lights import OUTLINE_SIDE, outline_sigma, with_outlines
-from calibration.flashlight.tone_curve import WORST_STEPS, compare_curves
-from calibration.flashlight.uncertainty import beam_error, position_sigma, unseen_error
+from calibration.flashlight.pictured import as_pictured, with_response
+from calibration.flashlight.uncertainty import position_sigma, unseen_error
 from calibration.flashlight.wall import WALL_TERMS
 from calibration.light import Light, Vector
 from calibration.lights import hand
@@ -47,10 +47,6 @@ LARGEST_SIGMA = 0.08  # of the range, before HONEST_SHARE
 LARGEST_JOINT_SIGMA = 0.25  # of lights from outlines and shading: the solver's shadow rays take over from there
 FEWEST_USED = 2 / 3  # of the photos that shading alone must place
 BY_SHADING = "lights: placed by how bright the ground is, and by nothing else"
-BY_DOUBTED_SHADING = (
-    BY_SHADING + ", which contradicts itself. Expect errors of {:.0%} of a light's distance; photos in light/, or RAW "
-    "photos, make them exact"
-)
 BY_OUTLINES = (
     "lights: placed by the outlines of shadows and object; how far away they all are, by how bright the ground is. "
     "The ground's brightness alone contradicts itself. Expect errors of a tenth of a light's distance; photos in "
@@ -87,19 +83,21 @@ def describe(
 ) -> LightFit:
     """Return the lights of a fit.
 
-    Albedo has no absolute scale: the brightest 1 % of the ground is set to 0.9 in its brightest channel. The flashlight
-    is taken as white over the session; a colour difference of one photo is a difference of its power.
+    Powers and beam are those by which the pictures show the ground, bent as they are. Albedo has no absolute scale: the
+    brightest 1 % of the ground is set to 0.9 in its brightest channel. The flashlight is taken as white over the
+    session; a colour difference of one photo is a difference of its power.
 
     Args:
         floor: position error that no residual shows, in all three coordinates together.
         sigma: of the positions, as residuals show it.
         judged: of the positions, by which a light is used or not.
     """
-    power, ambient = _colour(fit)
-    off_axis = cosines(fit.flashlights, fit.evidence)
-    beam, lack = without_splines(fit.flashlights.beam, off_axis, fit.weight, fit.priors.beam)
+    pictured = as_pictured(fit)
+    power, ambient = _colour(pictured)
+    off_axis = cosines(pictured.flashlights, pictured.evidence)
+    beam, lack = without_splines(pictured.flashlights.beam, off_axis, pictured.weight, pictured.priors.beam)
     power = power * np.exp(lack)
-    axes = fit.flashlights.axes()
+    axes = pictured.flashlights.axes()
     reasons = _verdicts(fit, judged, names)
     honest = np.sqrt(sigma**2 + floor[:, None] ** 2 / 3)
     lights = tuple(
@@ -228,19 +226,6 @@ def surely_placed(found: LightFit, centre: Float[np.ndarray, "3"]) -> float:
     return float(np.mean(np.array([light.used for light in found.lights]) & (sigma < LARGEST_SIGMA * reach)))
 
 
-def _doubted(found: LightFit, fit: FlashlightFit) -> LightFit:
-    """Return the lights with the error that a beam with rings may cause added to their sigmas, and told as the cue."""
-    error = beam_error(fit)
-    lights = tuple(
-        replace(light, sigma=np.hypot(light.sigma, one / np.sqrt(3)))
-        for light, one in zip(found.lights, error, strict=True)
-    )
-    reach = np.linalg.norm(fit.flashlights.positions - fit.evidence.cells.centre, axis=1)
-    size = np.linalg.norm([light.sigma for light in lights], axis=1) / reach
-    cue = BY_DOUBTED_SHADING.format(float(np.median(size)))
-    return replace(found, lights=lights, residuals=found.residuals | {"cue": cue})
-
-
 def told_doubt(fit: FlashlightFit) -> str:
     """Return what to add to the sentence about the lights where fits that are about as likely lie far apart, or ""."""
     reach = np.linalg.norm(fit.flashlights.positions - fit.evidence.cells.centre, axis=1)
@@ -259,7 +244,8 @@ def locate_lights(
     """Estimate one point light per usable photo (world), with the beam and the ambient light they share.
 
     Only camera and ground are known. Steps: mean colour of ground cells, fits of a few of them from several
-    starts, then a robust fit of all flashlights together. The object and its shadows are rejected as outliers, and what
+    starts, then a robust fit of all flashlights together, with the pictures' response and rings in the beam where the
+    photos ask for them. The object and its shadows are rejected as outliers, and what
     lies beyond the ground's end is left out. Where that places too few lights, outlines of shadows and shading are
     fitted together.
 
@@ -279,17 +265,14 @@ def locate_lights(
     evidence = before_ends(evidence, edges)
     LOG.info("fitting the lights to the ground's shading")
     first = first_fits(evidence)
-    fit = with_oval_beams(without_gloss(fit_flashlights(first.best(), evidence, free_tangent)), evidence)
-    fit = replace(fit, between=first.variance_about(fit.flashlights.positions))
+    plain = with_oval_beams(without_gloss(fit_flashlights(first.best(), evidence, free_tangent)), evidence)
+    fit = with_response(first, replace(plain, between=first.variance_about(plain.flashlights.positions)), evidence)
     names = [stack.paths[k].name for k in photos]
-    tone = compare_curves(fit, np.array(stack.gains)[photos], stack.is_linear)
-    floor = np.hypot(unseen_error(fit), WORST_STEPS * tone.error())
-    sigma, judged = (np.sqrt(one**2 + fit.between) for one in position_sigma(fit))
-    found = describe(fit, names, floor, sigma, judged)
-    found = replace(found, residuals=found.residuals | {"tone": tone.document(), "cue": BY_SHADING})
+    sigma = position_sigma(fit)
+    found = describe(fit, names, unseen_error(fit), sigma, sigma)
+    found = replace(found, residuals=found.residuals | {"cue": BY_SHADING})
     if surely_placed(found, evidence.cells.centre) >= FEWEST_USED or is_spoilt(found):
         return found
-    found = _doubted(found, fit)
     joint = with_outlines(evidence, stack, posed_camera, usable, fit.flashlights, edges, cues)
     if joint is None:
         return found
@@ -301,4 +284,4 @@ def locate_lights(
     if by_outlines < min(FEWEST_USED, by_shading):
         return found
     cue = (BY_CUES.format(cues.sentence()) if cues else BY_OUTLINES) + told_doubt(joint)
-    return replace(other, residuals=other.residuals | {"tone": tone.document(), "cue": cue})
+    return replace(other, residuals=other.residuals | {"cue": cue})

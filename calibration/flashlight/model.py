@@ -28,6 +28,7 @@ from calibration.flashlight.beam_profile import log_gain as beam_log_gain
 from calibration.flashlight.wall import BY, NO_WALL, WALL_TERMS, Wall, moved, wall_light
 from calibration.lights import hand
 from calibration.lights.ground_cells import GroundCells
+from calibration.lights.response import STEEPEST, WIDTHS, bend, integrals, slopes
 from calibration.outlines.terms import OutlineTerms
 
 NOISE = 0.01  # relative error granted to a cell; the widths of all priors count in this unit
@@ -53,12 +54,19 @@ class Flashlights:
     ambient: float
     aim: Float[np.ndarray, "3"]  # where the person aims on average
     wall: Wall = field(default_factory=lambda: NO_WALL)
+    response: Float[np.ndarray, " responses"] = field(
+        default_factory=lambda: np.zeros(0)
+    )  # of the pictures; none: linear
     oval: Float[np.ndarray, "photos 2"] | None = None  # log gain at OVAL_ANGLE by cos 2 phi, sin 2 phi; None: round
     _modelled: list[tuple[GroundCells, float, tuple]] = field(default_factory=list, init=False, repr=False)
 
     def per_flashlight(self) -> int:
         """Return the number of full coordinates per flashlight."""
         return PER_FLASHLIGHT if self.oval is None else PER_FLASHLIGHT + 2
+
+    def shared(self) -> int:
+        """Return the number of coordinates that all flashlights share: beam, ambient, wall, response, mean aim."""
+        return len(self.beam) + 1 + WALL_TERMS + len(self.response) + 3
 
     def axes(self) -> Float[np.ndarray, "photos 3"]:
         """Unit beam axes."""
@@ -81,8 +89,9 @@ class Flashlights:
             self.log_power + np.clip(flashlight[:, 6], -1, 1),
             self.beam + np.clip(rest[:terms], -1, 1),
             max(self.ambient + rest[terms], 0.0),
-            self.aim + rest[terms + 1 + WALL_TERMS :],
+            self.aim + rest[-3:],
             moved(self.wall, rest[terms + 1 : terms + 1 + WALL_TERMS]),
+            np.clip(self.response + rest[terms + 1 + WALL_TERMS : -3], -STEEPEST, STEEPEST),
             None if self.oval is None else self.oval + flashlight[:, PER_FLASHLIGHT:],
         )
 
@@ -112,12 +121,14 @@ class Evidence:
     log_grey: Samples
     weight: Samples  # 1 / variance; 0 where unusable
     outlines: OutlineTerms | None = None  # of shadows and object, for the same photos
+    exposure: Float[np.ndarray, " photos"] | None = None  # log of what each photo was divided by; None: linear pictures
 
     def at(self, some: Int[np.ndarray, " some"] | Bool[np.ndarray, " cells"]) -> "Evidence":
         """Return the evidence of some cells, without outlines."""
         cells = self.cells
         cells = replace(cells, points=cells.points[some], rgb=cells.rgb[:, some], usable=cells.usable[:, some])
-        return Evidence(cells, self.height, self.log_grey[:, some], self.weight[:, some])
+        log_grey, weight = self.log_grey[:, some], self.weight[:, some]
+        return Evidence(cells, self.height, log_grey, weight, exposure=self.exposure)
 
     @staticmethod
     def of(cells: GroundCells, gains: Float[np.ndarray, " photos"], height: float) -> "Evidence":
@@ -130,6 +141,20 @@ class Evidence:
 def log_irradiance(flashlights: Flashlights, evidence: Evidence) -> Samples:
     """Return the log irradiance at every cell, relative to a flashlight of power 1 at a hand's usual distance."""
     return _model(flashlights, evidence)[0]
+
+
+def log_pictured(flashlights: Flashlights, evidence: Evidence, middle: float | None = None) -> Samples:
+    """Return the log irradiance as the pictures' response shows it; middle: of the series, if evidence is a part."""
+    light, exposed = log_irradiance(flashlights, evidence), log_exposed(flashlights, evidence)
+    if not len(flashlights.response):
+        return light
+    return light + bend(exposed - (np.median(exposed) if middle is None else middle), flashlights.response)
+
+
+def log_exposed(flashlights: Flashlights, evidence: Evidence) -> Samples:
+    """Return the log of light times exposure; the response is stated about its median over the series."""
+    light = log_irradiance(flashlights, evidence)
+    return light if evidence.exposure is None else light + evidence.exposure[:, None]
 
 
 def cosines(flashlights: Flashlights, evidence: Evidence) -> Samples:
@@ -190,7 +215,7 @@ def _oval_terms(
 
 
 def jacobian(flashlights: Flashlights, evidence: Evidence):
-    """Derivatives of the log irradiance: (photos, cells, own) by each photo's, (photos, cells, terms + 4) by the rest.
+    """Derivatives of log_pictured: (photos, cells, own) by each photo's, (photos, cells, shared - 3) by the rest.
 
     Two turns are neglected: that of the oval's terms with flashlight and axis, and that of the wall's light with the
     flashlight's place, aim and beam. Both are a few per cent of the light.
@@ -215,20 +240,30 @@ def jacobian(flashlights: Flashlights, evidence: Evidence):
     by_wall = [(_by_wall(flashlights, evidence, wall + step, seen) - more) / BY for step in BY * np.eye(WALL_TERMS)[:2]]
     by_wall.append(_by_wall(flashlights, evidence, np.r_[wall[:2], 1.0], seen) if wall[2] <= 0 else more / wall[2])
     shared = [by_term * share[..., None], np.stack([np.ones_like(total), *by_wall], -1) / total[..., None]]
-    return flashlight, np.concatenate(shared, -1)
+    if not len(flashlights.response):
+        return flashlight, np.concatenate(shared, -1)
+    light = log_exposed(flashlights, evidence)
+    light = light - np.median(light)
+    slope = 1 + (slopes(light) @ flashlights.response)[..., None]
+    return flashlight * slope, np.concatenate([*(slope * one for one in shared), integrals(light)], -1)
 
 
-def cell_residuals(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> Samples:
-    """Return log measured minus log modelled brightness, less each cell's weighted mean, which is its log albedo.
-
-    Variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973).
-    """
-    raw = evidence.log_grey - log_irradiance(flashlights, evidence)
+def log_albedo(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> Float[np.ndarray, " cells"]:
+    """Return the log albedo of each cell that fits its weighted samples best; of a cell without any their median."""
+    raw = evidence.log_grey - log_pictured(flashlights, evidence)
     total = weight.sum(0)
     level = (weight * raw).sum(0) / np.maximum(total, 1e-12)
     silent = total <= 0  # no photo votes: the median lets such a cell come back
     level[silent] = _median(raw[:, silent], evidence.weight[:, silent] > 0)
-    return raw - level
+    return level
+
+
+def cell_residuals(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> Samples:
+    """Return log measured minus log modelled brightness, for the albedos that fit best.
+
+    Variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973).
+    """
+    return evidence.log_grey - log_pictured(flashlights, evidence) - log_albedo(flashlights, evidence, weight)
 
 
 def _median(values: Float[np.ndarray, "rows n"], known: Bool[np.ndarray, "rows n"]) -> Float[np.ndarray, " n"]:
@@ -241,10 +276,10 @@ def _median(values: Float[np.ndarray, "rows n"], known: Bool[np.ndarray, "rows n
 
 def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
     """Return the residuals of the priors, divided by their sigmas, and their derivatives (rows x full)."""
-    n, terms = len(flashlights.positions), len(flashlights.beam)
+    n, terms, shared = len(flashlights.positions), len(flashlights.beam), flashlights.shared()
     own = flashlights.per_flashlight()
-    full = own * n + terms + 4 + WALL_TERMS
-    jac = np.zeros((3 * n + terms + 4 + WALL_TERMS + (own - PER_FLASHLIGHT) * n, full))
+    full = own * n + shared
+    jac = np.zeros((3 * n + shared + (own - PER_FLASHLIGHT) * n, full))
     first, second = across(flashlights.axes())
     miss = flashlights.targets - flashlights.aim
     width = priors.aim
@@ -262,6 +297,7 @@ def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
         np.full(max(terms - SMOOTH_TERMS, 0), priors.ring),
         priors.ambient,
         priors.wall,
+        WIDTHS[: len(flashlights.response)],
         np.full(3, priors.aim_mean),
     ]
     jac[3 * n : 3 * n + len(rest), rest] = np.diag(1 / widths)
@@ -273,7 +309,7 @@ def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
         (miss * first).sum(1) / width,
         (miss * second).sum(1) / width,
         own_power / bent**0.5 / priors.log_power,
-        np.r_[flashlights.beam, flashlights.ambient, flashlights.wall - NO_WALL, missed] / widths,
+        np.r_[flashlights.beam, flashlights.ambient, flashlights.wall - NO_WALL, flashlights.response, missed] / widths,
         oval,
     ]
     return value, jac
@@ -290,10 +326,10 @@ def across(axes: Float[np.ndarray, "photos 3"]):
 def free_tangent(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
     """Return a basis per free photo: position 3, aim 2 (across the beam), power 1, [oval 2]; and the shared parameters.
 
-    The shared parameters are beam, ambient, wall and mean aim.
+    The shared parameters are beam, ambient, wall, response and mean aim.
     """
     n, own = len(flashlights.positions), flashlights.per_flashlight()
-    rest = len(flashlights.beam) + 4 + WALL_TERMS
+    rest = flashlights.shared()
     free = own - 1
     out = np.zeros((own * n + rest, free * n + rest))
     first, second = across(flashlights.axes())
@@ -323,7 +359,7 @@ def normal_equations(
     """Return J' W J and J' W r in the full coordinates with priors; albedo is eliminated by its Schur complement.
 
     Triggs et al., Bundle Adjustment - A Modern Synthesis (2000), section 6. Full coordinates: per photo position (world
-    length), a point on the beam axis (world length), log power, [oval 2]; then beam, ambient, wall, mean aim.
+    length), a point on the beam axis (world length), log power, [oval 2]; then beam, ambient, wall, response, mean aim.
 
     Args:
         slopes: of `jacobian`, where the caller has them.

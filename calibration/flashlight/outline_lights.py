@@ -71,7 +71,7 @@ def with_outlines(
     if terms is None:
         return None
     starts = [*shadow_starts(terms.maps, shadows.object_mask, posed_camera), by_shading.positions]
-    cells = replace(_lit_cells(evidence, shadows, posed_camera), outlines=terms)
+    cells = replace(_lit_cells(evidence, shadows, posed_camera), outlines=terms, exposure=None)
     fit = searched(starts, cells)
     wide = _terms(coarse, field, shadows, posed_camera, cues, True) if _at_odds(fit, terms) > OUTLINES_WRONG else None
     if wide is not None and _at_odds(fit, wide) < REPAIRED * _at_odds(fit, terms):

@@ -1,8 +1,7 @@
 """Locate the flashlight in each photo from the board as seen by the phone that carries it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from calibration.flashlight.fit import (
     FlashlightFit,
     before_ends,
     collect,
-    first_guess,
+    first_fits,
     fit_flashlights,
     without_gloss,
 )
@@ -23,7 +22,7 @@ from calibration.flashlight.led_photo import FITTED_SIGMA, QUARTER_TURNS, BackVi
 from calibration.flashlight.light_estimate import LightFit, describe
 from calibration.flashlight.model import Flashlights, free_tangent
 from calibration.flashlight.outline_lights import outlines_of
-from calibration.flashlight.tone_curve import WORST_STEPS, ToneTest, compare_curves
+from calibration.flashlight.pictured import with_response
 from calibration.flashlight.uncertainty import position_sigma, unseen_error
 from calibration.ground.table_edges import TableEdge
 from calibration.lights.fusion import disagree, fuse
@@ -94,7 +93,9 @@ def locate_lights_from_phone(
     edges = ground_ends(stack, posed_camera, usable)
     evidence = before_ends(evidence, edges)
     lens, poses = _poses(views)
-    alone = without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent))
+    first = first_fits(evidence)
+    alone = without_gloss(fit_flashlights(first.best(), evidence, free_tangent))
+    alone = with_response(first, alone, evidence)
     poses = _least_turned(poses, views, alone.flashlights)
     partner = pair_in_order(poses, alone.flashlights, evidence.cells.centre, photos)
     if len(poses) == len(usable) and (partner >= 0).sum() < FEWEST_PAIRED * len(photos):
@@ -104,18 +105,16 @@ def locate_lights_from_phone(
         raise _too_few(int(carried.posed().sum()), views)
     lens_error = lens.camera.sigmas["fx"] / lens.camera.fx * carried.reach  # a longer lens stands farther away
     shown = None if views.led_offset_mm else _shown_by_outlines(carried, alone, stack, posed_camera, usable, edges)
-    tone_of = partial(compare_curves, gains=np.array(stack.gains)[photos], is_linear=stack.is_linear)
     middle_error = float(np.median(lens_error[carried.posed()]))
-    fit, offset_error, choice = _fit(carried, alone, views, middle_error, shown, tone_of)
+    fit, offset_error, choice = _fit(carried, alone, views, middle_error, shown)
     floor = np.where(carried.posed(), np.hypot(offset_error, lens_error), unseen_error(fit))
-    tone = tone_of(fit)
-    names, floor = [stack.paths[k].name for k in photos], np.hypot(floor, WORST_STEPS * tone.error())
-    found = describe(fit, names, floor, *position_sigma(fit))
+    names = [stack.paths[k].name for k in photos]
+    sigma = position_sigma(fit)
+    found = describe(fit, names, floor, sigma, sigma)
     residuals = (
         found.residuals
         | _phone_back(views.back, choice)
         | {
-            "tone": tone.document(),
             "led_offset_mm": _led_offset(fit, carried).tolist(),
             "led_offset_sigma_mm": offset_error,
             "phone_reprojection_rms_px": lens.rms_px,
@@ -154,18 +153,17 @@ def _fit(
     views: PhoneViews,
     lens_error_mm: float,
     shown: _Offset | None,
-    tone_of: Callable[[FlashlightFit], ToneTest],
 ) -> tuple[FlashlightFit, float, Choice | None]:
     """Fit with the LED's offset given, fitted, or read from the phone's back; return also its error, mm, and choice.
 
-    The outlines' offset is taken where it is the surer one, given how far other tone curves move the lights, and where
-    it contradicts the shading: then the tone curve or the beam is not what it is taken for. A photo of the back is used
+    The outlines' offset is taken where it is the surer one, and where it contradicts the shading: then the pictures or
+    the beam are not what they are taken for. A photo of the back is used
     after these, which distinguish the main lens from the others and give the phone's orientation.
     """
     known = None if views.led_offset_mm is None else np.array(views.led_offset_mm)
     fit, error = _fit_offset(carried, alone, known), OFFSET_ERROR_MM[0 if known is None else 1]
     shaded = _led_offset(fit, carried)
-    if shown is not None and _is_surer(shown, shaded, float(np.hypot(error, np.median(tone_of(fit).error())))):
+    if shown is not None and _is_surer(shown, shaded, error):
         fit, error = _fit_offset(carried, alone, shown[0]), float(np.sqrt(np.trace(shown[1])))
     elif known is None and not led_is_beside(shaded):  # the shading misleads: better none than this
         fit, error = _fit_offset(carried, alone, np.zeros(3)), UNKNOWN_OFFSET_MM

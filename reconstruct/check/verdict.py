@@ -206,8 +206,7 @@ def _check_view(source: Source, photos: Photos, calibration: Calibration, is_par
             f"({shown}; ...). Photograph in a dark room, camera still, flashlight in other places."
         )
     cover = shadow_cover(build_scene(stack, calibration, LONG_SIDE, mask=photos.mask))
-    doubts = tone_doubts(calibration) if source.session is not None else ()
-    doubts = (*doubts, *map(str, calibration.residuals.get("warnings", [])))
+    doubts = tuple(map(str, calibration.residuals.get("warnings", [])))
     findings = with_power_changes(photos.findings, calibration, stack)
     readiness = judge(calibration, findings, cover, doubts, is_part)
     notes = tuple(map(str, calibration.residuals.get("notes", [])))
@@ -238,10 +237,3 @@ def with_power_changes(findings: Sequence[Finding], calibration: Calibration, st
     is_room = sum(one.kind == "ambient light" for one in findings) > ALL_LIT * len(stack.paths)
     kept = [one for one in findings if is_room or one.drop or one.kind != "ambient light" or one.photo not in names]
     return (*kept, *changed)
-
-
-def tone_doubts(calibration: Calibration) -> tuple[str, ...]:
-    """Return doubts about the assumed tone curve that follow from the ground's shading."""
-    tested = calibration.residuals.get("tone")
-    doubt = str(tested["doubt"]) if isinstance(tested, dict) else ""
-    return (doubt,) if doubt else ()
