@@ -206,20 +206,6 @@ def test_ground_that_is_mostly_in_shadow_has_the_albedo_that_it_shows_in_the_sun
     assert share_wrong(found.visibility, found.confidence, truth, ~truth.mask) < 0.003
 
 
-@pytest.mark.parametrize("paint", [(0.09, 0.03, 0.012), (0.03, 0.05, 0.012)])
-def test_dark_paint_of_another_hue_is_object_and_no_ground_in_the_dark(paint):
-    scene, truth = render((BALL,), replace(PLAIN, n_lights=20, noise=0.002, ambient=0.02))
-    inside = torch.from_numpy(truth.mask)
-    ratio = torch.tensor(paint) / scene.rgb[:, inside].amax(0).mean(0)  # the whole ball, some fifth of the ground's
-    painted = replace(scene, rgb=torch.where(inside[..., None], scene.rgb * ratio, scene.rgb))
-    wooden = replace(
-        painted, rgb=torch.where(inside[..., None], painted.rgb, painted.rgb * torch.tensor([1.2, 1, 0.7]))
-    )
-    found = ground_module.test_ground(wooden)
-    assert iou(found.mask, truth) > 0.95
-    assert found.mask_confidence[inside].gt(0).float().mean() > 0.95
-
-
 def test_what_is_dark_where_no_shadow_of_the_object_may_fall_is_no_shadow():
     """A table ends at a line; the floor behind it stays dark under some lights, as does ground behind a flashlight."""
     scene, truth = render(HEAP, PLAIN)

@@ -19,7 +19,6 @@ from calibration.ground.ground_field import DARKEST, GroundField, at_photo_size,
 from calibration.ground.ground_shadows import LIKELY, BareGround, bare_ground
 from calibration.ground.table_edges import seen_beyond
 from reconstruct.labels.ground_test import (
-    GAP_CONFIDENCE,
     NOISE_FLOOR,
     PIXELS_AT_ONCE,
     RIM,
@@ -33,6 +32,7 @@ from reconstruct.labels.outline import Outline, dilated, may_hold_shadow, object
 from reconstruct.scene import Scene, grey_irradiance, ground_points
 from reconstruct.shading.noise import Noise
 
+GAP_CONFIDENCE = 0.2  # of the mask where a pixel may be ground in a gap as well as object
 EXPLAINED = 0.7  # of the picture: a light model that makes ground of so much needs no other
 GAINED = 0.2  # of the picture: how much more of it the field must make ground
 # Log units: powers that are off by less on the ground near the object are better than those that the object shows. On a

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from calibration.ground.ground_shadows import BareGround
-from reconstruct.labels.ground_colour import brightest_albedo, ground_around, has_other_hue
+from reconstruct.labels.ground_colour import brightest_albedo, ground_around
 from reconstruct.labels.level_tops import find_level_tops
 from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.outline import (
@@ -32,10 +32,8 @@ ALIKE = 0.005  # one sigma of a lit sample's ratio, at least
 NOISE_FLOOR = 3e-4  # linear: half of an 8-bit sRGB step in the darks
 SEEN_SIGMAS = 5.0  # a lit sample must lie this far above the noise to be used
 NOT_GROUND = 0.45  # share of seen samples between lit and dark from which a pixel is object; ground 0-0.1, object > 0.6
-NEVER_LIT = 0.25  # of the neighbours' albedo: a pixel of their hue whose third-brightest sample is darker was never lit
-GAP_SHADOW = 0.5  # of the photos: darker pixels that never outshine the ground may be ground in the gap at a contact
+NEVER_LIT = 0.25  # of the neighbours' albedo: a pixel whose third-brightest sample is darker was never lit
 FEWEST_AGREEING = 4  # lit samples that agree on the pixel's ground albedo; fewer may do so by chance
-GAP_CONFIDENCE = 0.2  # of the mask there
 PENUMBRA = 3  # px: such parts are wider
 FEWEST_SAMPLES = 3  # seen samples that a pixel needs to be classified
 RIM, RIM_SHARE = 2, 0.4  # px around a found mask, and the share of their confidence that ground labels keep there
@@ -78,7 +76,6 @@ class _Behaviour:
     between: Float[Tensor, "height width"]  # see _share_between
     albedo: Float[Tensor, "height width 3"]  # if it is ground
     known: Bool[Tensor, "height width"]  # it has light and ground to compare with
-    gap: Bool[Tensor, "height width"]  # mostly in shadow and never brighter than the ground around
     relative: Float[Tensor, "photos height width"]  # brightness over that of lit ground of the pixel's albedo
     seen: Bool[Tensor, "photos height width"]  # lit ground would be far above the noise
     lit_value: Float[Tensor, "photos height width"]  # brightness of lit ground of the pixel's albedo
@@ -137,8 +134,8 @@ def _behaviour(scene: Scene) -> tuple[_Behaviour, Float[Tensor, "photos height w
     lit = (seen & ((relative - 1).abs() < LIT_BAND)).float()
     albedo, ever_lit = _albedo(scene, samples, gain, lit), lit.sum(0) > 0
     del lit
-    known, gap = _gap(scene, level, albedo, seen, between, samples)
-    return _Behaviour(between, albedo, known, gap, relative, seen, lit_value, level, ever_lit), gain, noise
+    known = _known(level, seen, between, samples)
+    return _Behaviour(between, albedo, known, relative, seen, lit_value, level, ever_lit), gain, noise
 
 
 def _samples(scene: Scene) -> _Samples:
@@ -265,31 +262,23 @@ def _share_between(
     return torch.cat(shares)
 
 
-def _gap(
-    scene: Scene,
+def _known(
     level: Float[Tensor, "height width"],
-    albedo: Float[Tensor, "height width 3"],
     seen: Bool[Tensor, "photos height width"],
     between: Float[Tensor, "height width"],
     samples: _Samples,
-) -> tuple[Bool[Tensor, "height width"], Bool[Tensor, "height width"]]:
-    """Return `known` and `gap` of _Behaviour, from the brightness of the ground nearby."""
+) -> Bool[Tensor, "height width"]:
+    """Return `known` of _Behaviour, from the brightness of the ground nearby."""
     ground = ((between < NOT_GROUND) & (level > 0)).float()
-    window = 2 * (max(level.shape) // 24) + 1
-    near, count = local_mean(torch.stack([ground * level, ground]), window)
-    near = near / count.clamp(min=1e-6)
+    near, count = local_mean(torch.stack([ground * level, ground]), 2 * (max(level.shape) // 24) + 1)
     ratio = torch.where(samples.usable, samples.value / samples.expected, torch.zeros(())).reshape(seen.shape)
     third = ratio.topk(min(3, len(ratio)), dim=0).values[-1]
-    never_lit = (third < NEVER_LIT * near) & (between >= NOT_GROUND)
-    if scene.rgb is not None and bool(never_lit.any()):
-        never_lit &= ~has_other_hue(scene.rgb, scene.tint, albedo, ground > 0, window)
-    shadow = (seen & (ratio < DARK_LEVEL * near)).sum(0)
-    gap = (third < (1 + LIT_BAND) * near) & (shadow > GAP_SHADOW * seen.sum(0))
-    return (seen.sum(0) >= FEWEST_SAMPLES) & ~never_lit, gap
+    never_lit = (third < NEVER_LIT * near / count.clamp(min=1e-6)) & (between >= NOT_GROUND)
+    return (seen.sum(0) >= FEWEST_SAMPLES) & ~never_lit
 
 
 def _mask(scene: Scene, pixels: _Behaviour) -> Outline:
-    """Return coverage and its confidence: 0 if unknown or doubtful, low in the gap at a contact, half if overruled."""
+    """Return coverage and its confidence: 0 if unknown or doubtful, half if overruled."""
     if scene.mask is not None:
         return Outline(scene.mask, torch.ones_like(scene.mask))
     assert scene.rgb is not None
@@ -301,9 +290,6 @@ def _mask(scene: Scene, pixels: _Behaviour) -> Outline:
     region = object_region(region | tops.sure, pixels.known) if tops.sure.any() else region
     margin = (pixels.between - NOT_GROUND).abs() / NOT_GROUND
     confidence = torch.where(likely == region, (0.5 + margin).clamp(max=1.0), torch.full_like(margin, 0.5))
-    reach = 2 * (max(region.shape) // 100) + 1
-    rim = dilated(~region, reach)
-    confidence = torch.where(pixels.gap & region & rim, torch.full_like(margin, GAP_CONFIDENCE), confidence)
     share = share_of_region(grey_of(scene.rgb) + 3 * NOISE_FLOOR, region, ~region & few)
     unsure = share.isfinite()
     region = torch.where(unsure, share > 0.5, region)
