@@ -43,8 +43,8 @@ from capture.photos.photo import PhotoStack
 LOG = logging.getLogger(__name__)
 OTHER_POWER = 3.0  # factor between one flashlight's power in two photos
 POWER_SIGMAS = 6.0  # or in how much the other photos differ, where they do not tell their exposure
-LARGEST_SIGMA = 0.08  # of the range, before HONEST_SHARE
-LARGEST_JOINT_SIGMA = 0.25  # of lights from outlines and shading: the solver's shadow rays take over from there
+SURE_SIGMA = 0.08  # of the range: lights that shading alone places so well need no outlines
+LARGEST_SIGMA = 0.25  # of the range, of a light that is used: the solver's shadow rays take over from there
 FEWEST_USED = 2 / 3  # of the photos that shading alone must place
 BY_SHADING = "lights: placed by how bright the ground is, and by nothing else"
 BY_OUTLINES = (
@@ -151,7 +151,6 @@ def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: l
     size = np.linalg.norm(sigma, axis=1) / reach
     outlines = fit.evidence.outlines
     contradiction = np.zeros(len(reach)) if outlines is None else outlines.misfit(flashlights.positions)
-    largest = LARGEST_SIGMA if outlines is None else LARGEST_JOINT_SIGMA
     height = flashlights.positions[:, 2] - fit.evidence.height
     brighter = flashlights.log_power - np.median(flashlights.log_power)
     too_bright = max(np.log(OTHER_POWER), POWER_SIGMAS * spread(brighter))
@@ -173,8 +172,8 @@ def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: l
                 f"the light would be {reach[k]:.0f} mm from the middle of the photo: a hand holds it "
                 f"{hand.NEAREST:.0f} to {hand.FARTHEST:.0f} mm away. Check the size of the board's squares"
             )
-        if size[k] > largest:
-            why.append(f"its place is uncertain by {size[k]:.0%} of its distance (limit {largest:.0%})")
+        if size[k] > LARGEST_SIGMA:
+            why.append(f"its place is uncertain by {size[k]:.0%} of its distance (limit {LARGEST_SIGMA:.0%})")
         if abs(brighter[k]) > too_bright:
             why.append(
                 f"from there its flashlight would be {np.exp(brighter[k]):.2g} times as strong as in the other photos "
@@ -216,14 +215,14 @@ def _residuals(fit: FlashlightFit, names: list[str], sigma: Float[np.ndarray, "p
 
 
 def surely_placed(found: LightFit, centre: Float[np.ndarray, "3"]) -> float:
-    """Return the share of lights that are used and whose stated error stays below LARGEST_SIGMA of their distance.
+    """Return the share of lights that are used and whose stated error stays below SURE_SIGMA of their distance.
 
     A flashlight has one power. Powers that differ by tens of per cent, or a tone curve in doubt, contradict the shading
     of all photos, however well each photo's own is fitted.
     """
     sigma = np.array([np.linalg.norm(light.sigma) for light in found.lights])
     reach = np.linalg.norm([light.homogeneous()[:3] - centre for light in found.lights], axis=1)
-    return float(np.mean(np.array([light.used for light in found.lights]) & (sigma < LARGEST_SIGMA * reach)))
+    return float(np.mean(np.array([light.used for light in found.lights]) & (sigma < SURE_SIGMA * reach)))
 
 
 def told_doubt(fit: FlashlightFit) -> str:
