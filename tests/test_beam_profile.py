@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calibration.flashlight import joint_search, model
+from calibration.flashlight import model
 from calibration.flashlight.beam_profile import (
     RING_SPAN,
     RING_TERMS,
@@ -11,7 +11,10 @@ from calibration.flashlight.beam_profile import (
     log_gain,
     without_splines,
 )
+from calibration.flashlight.descent import refine
+from calibration.flashlight.fit import ALIKE_POWER, FAR, NEAR, START_BEAM
 from calibration.flashlight.model import Evidence, Flashlights, Priors
+from calibration.flashlight.pictured import bent, places_held
 from calibration.lights.ground_cells import GroundCells
 
 SCALE = 600.0  # mm
@@ -45,7 +48,9 @@ def _table(n_photos: int = 12):
 
 def test_aims_and_powers_of_beams_with_rings_are_found():
     places, axes, evidence = _table()
-    found, _ = joint_search._held(places, evidence, None)
+    n, middle = len(places), np.zeros((len(places), 3))
+    start = Flashlights(places, middle, np.zeros(n), np.array([START_BEAM, 0.0, 0.0, 0.0]), 0.0, np.zeros(3))
+    found, _ = refine(bent(start, evidence), evidence, ALIKE_POWER, places_held, FAR + NEAR)
     off = np.degrees(np.arccos(np.clip((found.axes() * axes).sum(1), -1, 1)))
     assert np.median(off) < 1.0
     assert off.max() < 3.0

@@ -7,8 +7,10 @@ import pytest
 from ball_shadows import EYE, RADIUS, drawn
 
 from calibration.flashlight import joint_search, outline_lights
-from calibration.flashlight.fit import FlashlightFit, does_not_follow
+from calibration.flashlight.fit import ALIKE_POWER, FlashlightFit, does_not_follow, variance_about
 from calibration.flashlight.model import Evidence, Flashlights, free_tangent, log_irradiance
+from calibration.flashlight.outline_lights import outline_sigma
+from calibration.flashlight.pictured import bent
 from calibration.flashlight.wall import NO_WALL, Wall
 from calibration.lights.ground_cells import GroundCells
 from calibration.outlines.terms import OutlineTerms
@@ -34,6 +36,12 @@ def _shaded(maps, lights: np.ndarray, wall: Wall = NO_WALL, grain: float = 0.02)
     return replace(evidence, log_grey=grey, outlines=OutlineTerms(maps, EYE, 0.0, every, every))
 
 
+def _state(places: np.ndarray, evidence: Evidence) -> Flashlights:
+    """Flashlights of one power that aim at the ball, with rings and without a wall."""
+    beam = np.array([2.0, 0.0, 0.0, 0.0])
+    return bent(Flashlights(places, 0 * places, np.zeros(len(places)), beam, 0.01, np.zeros(3)), evidence)
+
+
 def _off(places: np.ndarray, lights: np.ndarray) -> np.ndarray:
     return np.linalg.norm(places - lights, axis=1) / np.linalg.norm(lights, axis=1)
 
@@ -48,7 +56,8 @@ def test_lights_are_found_from_rough_starts_of_which_one_is_far_off(ball):
     rng = np.random.default_rng(1)
     rough = 0.75 * lights * np.exp(0.1 * rng.standard_normal(lights.shape))
     rough[5] *= 0.6
-    fit = joint_search.searched([np.roll(rough, 3, axis=0), rough], _shaded(maps, lights))
+    evidence = _shaded(maps, lights)
+    fit = joint_search.searched([np.roll(rough, 3, axis=0)], _state(rough, evidence), evidence)
     assert np.median(_off(fit.flashlights.positions, lights)) < 0.05 < 0.2 < np.median(_off(rough, lights))
     assert _off(fit.flashlights.positions, lights).max() < 0.08
 
@@ -58,7 +67,8 @@ def test_lights_are_found_from_rough_starts_of_which_one_is_far_off(ball):
 def test_a_wall_is_found_where_one_is_and_nowhere_else(ball, wall):
     _, lights, maps = ball
     rough = 0.9 * lights * np.exp(0.05 * np.random.default_rng(1).standard_normal(lights.shape))
-    found = joint_search.searched([rough], _shaded(maps, lights, wall, 0.005)).flashlights
+    evidence = _shaded(maps, lights, wall, 0.005)
+    found = joint_search.searched([rough], _state(rough, evidence), evidence).flashlights
     assert np.median(_off(found.positions, lights)) < 0.03
     if wall[2] > 0:
         assert abs(np.angle(np.exp(1j * (found.wall[0] - wall[0])))) < 0.3
@@ -84,7 +94,7 @@ def _with_one_lost(maps, lights: np.ndarray, k: int) -> tuple[FlashlightFit, Evi
     beam = np.array([3.0, 0.0, 0.0, 0.0])
     state = Flashlights(places, 0 * places, np.zeros(len(lights)), beam, 0.0, np.zeros(3))
     weight = evidence.weight * (np.arange(len(lights)) != k)[:, None]
-    return FlashlightFit(state, evidence, weight, joint_search.LOOSE, free_tangent), evidence
+    return FlashlightFit(state, evidence, weight, ALIKE_POWER, free_tangent), evidence
 
 
 def test_a_photo_that_the_shading_contradicts_is_a_stray_whatever_its_outline(ball):
@@ -118,9 +128,35 @@ def test_fits_are_compared_by_the_cells_that_they_are_fitted_to(ball):
     _, lights, maps = ball
     evidence = _shaded(maps, lights)
     state = Flashlights(lights, 0 * lights, np.zeros(len(lights)), np.zeros(4), 0.0, np.zeros(3))
-    fit = FlashlightFit(state, evidence, evidence.weight, joint_search.LOOSE, free_tangent)
+    fit = FlashlightFit(state, evidence, evidence.weight, ALIKE_POWER, free_tangent)
     for misfit in (0.3, 2.0, 4.0):  # of noise
         found = [(0.0, fit, misfit * joint_search.NOISE), (1.5, fit, 1.1 * misfit * joint_search.NOISE)]
         cells = (evidence.weight > 0).sum() / joint_search.alike(evidence.weight)
         gap = np.diff(joint_search._posteriors(found, evidence))
         np.testing.assert_allclose(gap, 1.5 + cells * np.log(1.1), rtol=1e-9)
+
+
+def test_the_stated_error_covers_the_other_fits(ball):
+    _, lights, maps = ball
+    fit, _ = _with_one_lost(maps, lights, 3)
+    doubt = np.full(lights.shape, 40.0**2)
+    with_others, alone = outline_sigma(replace(fit, between=doubt)), outline_sigma(replace(fit, between=0.0))
+    np.testing.assert_allclose(with_others**2 - alone**2, doubt, rtol=1e-6)
+
+
+def test_the_variance_of_a_mixture_is_about_the_fit_that_is_chosen():
+    places = np.array([[[0.0, 0.0, 1.0]], [[0.0, 0.0, 3.0]]])
+    np.testing.assert_allclose(variance_about(places[0], places, np.array([1.0, 1.0])), [[0.0, 0.0, 2.0]])
+    assert variance_about(places[0], places, np.array([1.0, 1e-6])).max() < 1e-5
+
+
+def test_every_third_ray_of_an_outline_costs_as_all_of_them_do(ball):
+    _, lights, maps = ball
+    terms = _shaded(maps, lights).outlines
+    assert terms is not None
+    moved = lights * [1.0, 1.0, 1.3]
+    some = terms.thinned(3)
+    assert len(some.maps.starts) == -(-len(terms.maps.starts) // 3)
+    np.testing.assert_allclose(some.cost(moved), terms.cost(moved), rtol=0.1)
+    value, whole = some.rows(moved)[0], terms.rows(moved)[0]
+    np.testing.assert_allclose(value @ value, whole @ whole, rtol=0.1)

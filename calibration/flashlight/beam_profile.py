@@ -16,7 +16,6 @@ EXTRA_TERMS = 3  # r2, r3, r4: fewer cannot follow a real beam (position errors 
 SMOOTH_TERMS = 1 + EXTRA_TERMS  # what comes after these are splines
 RING_SPAN = 0.56  # of u that splines cover: up to 64 degrees off the axis
 RING_TERMS = 32  # 2 degrees apart at 30 degrees, where LEDs have rings
-BROAD_TERMS = 16  # 4 degrees apart, where outlines are fitted with the brightness: it has fewer cells there
 PROFILE = 2000  # places at which the splines' sum is tabulated
 
 Samples = Float[np.ndarray, "*batch"]

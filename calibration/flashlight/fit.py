@@ -42,7 +42,6 @@ ALIKE_POWER = Priors(log_power=0.02)  # ... but it is one: what a battery loses 
 STEADY_POWER = 0.003  # narrowest belief in a constant flashlight
 POWER_ERROR = 0.012  # spread of fitted powers that a perfectly steady flashlight shows under LOOSE_POWER
 POWER_SHARE = 0.5  # of the spread beyond that: a belief this wide still steadies the positions
-POWER_VOTE = 0.1  # in the search, a flashlight 10 % brighter than the others counts like 1 % of misfit
 START_BEAM = 2.0  # cos^2: between a bare LED and a focused one
 START_BEAMS = (2.0, 6.0)  # a bare LED to a focused one
 START_AMBIENT = 0.02  # of a flashlight at a hand's usual distance: a dark room
@@ -137,19 +136,6 @@ def before_ends(evidence: Evidence, edges: Sequence[TableEdge]) -> Evidence:
     return replace(evidence, weight=evidence.weight * inside) if inside.sum() >= MIN_GROUND else evidence
 
 
-def misfits(residual: Float[np.ndarray, "trials cells"], common: float | None):
-    """Return the median absolute residual of each trial (log units), an unusual power added, and its log power.
-
-    Args:
-        common: log power that flashlights are expected to share; None if unknown.
-    """
-    offset = np.median(residual, axis=1)
-    size = np.median(np.abs(residual - offset[:, None]), axis=1)
-    if common is not None:
-        size += POWER_VOTE * np.minimum(np.abs(offset - common), 1)
-    return size, offset
-
-
 def thinned(evidence: Evidence) -> Evidence:
     """Return at most FEW_CELLS of the cells that are known in most photos: enough for a search."""
     known = np.flatnonzero((evidence.weight > 0).mean(0) > 0.5)
@@ -209,10 +195,12 @@ def _on_sphere(evidence: Evidence, distance: float, beam: float) -> Flashlights:
     shown, index = np.zeros_like(log_grey), np.zeros(len(log_grey), int)
     for _ in range(ROUNDS):
         brightness = log_grey - np.nanmedian(log_grey - shown, axis=0)
-        best = [misfits(row[known] - table[:, known], None) for row in brightness for known in [np.isfinite(row)]]
-        index = np.array([int(size.argmin()) for size, _ in best])
-        power = np.array([offset[k] for (_, offset), k in zip(best, index, strict=True)])
-        shown = table[index] + power[:, None]
+        for photo, row in enumerate(brightness):
+            known = np.isfinite(row)
+            residual = row[known] - table[:, known]
+            power = np.median(residual, axis=1)
+            index[photo] = np.median(np.abs(residual - power[:, None]), axis=1).argmin()
+            shown[photo] = table[index[photo]] + power[index[photo]]
     return state(places[index])
 
 

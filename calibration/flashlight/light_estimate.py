@@ -48,13 +48,12 @@ LARGEST_SIGMA = 0.25  # of the range, of a light that is used: the solver's shad
 FEWEST_USED = 2 / 3  # of the photos that shading alone must place
 BY_SHADING = "lights: placed by how bright the ground is, and by nothing else"
 BY_OUTLINES = (
-    "lights: placed by the outlines of shadows and object; how far away they all are, by how bright the ground is. "
-    "The ground's brightness alone contradicts itself. Expect errors of a tenth of a light's distance; photos in "
-    "light/, or RAW photos, make them exact"
+    "lights: placed by the outlines of shadows and object together with how bright the ground is, which alone leaves "
+    "them uncertain; photos in light/, or RAW photos, make them exact"
 )
 BY_CUES = (
-    "lights: placed by the outlines of shadows and object; how far away they all are, by {}. The ground's brightness "
-    "alone contradicts itself"
+    "lights: placed by the outlines of shadows and object together with how bright the ground is; how far away they "
+    "all are, by {}"
 )
 AMBIGUOUS = 0.1  # of a light's distance, between fits that are about as likely: the user is told
 BY_SEVERAL = (

@@ -104,7 +104,7 @@ class Priors:
     aim: float = hand.AIM  # mm by which single beams miss the common aim
     aim_mean: float = hand.AIM_MEAN  # mm by which the common aim misses the middle of the photo
     beam: float = 5.0  # m, r2, r3, r4
-    ring: float = 20.0  # splines
+    ring: float = 0.3  # splines: rings of LEDs are dimmer or brighter by tens of per cent
     wall: tuple[float, ...] = (10.0, 1.0, 1.0)  # azimuth: none is likelier; log distance; albedo
     ambient: float = 0.2  # of a flashlight at a hand's usual distance
     power_outlier: float = 0.1  # a photo this far (log) from the common power is another exposure: Geman-McClure
@@ -143,18 +143,18 @@ def log_irradiance(flashlights: Flashlights, evidence: Evidence) -> Samples:
     return _model(flashlights, evidence)[0]
 
 
-def log_pictured(flashlights: Flashlights, evidence: Evidence, middle: float | None = None) -> Samples:
-    """Return the log irradiance as the pictures' response shows it; middle: of the series, if evidence is a part."""
-    light, exposed = log_irradiance(flashlights, evidence), log_exposed(flashlights, evidence)
+def log_pictured(flashlights: Flashlights, evidence: Evidence) -> Samples:
+    """Return the log irradiance as the pictures' response shows it."""
+    light = log_irradiance(flashlights, evidence)
     if not len(flashlights.response):
         return light
-    return light + bend(exposed - (np.median(exposed) if middle is None else middle), flashlights.response)
+    return light + bend(_log_exposed(flashlights, evidence), flashlights.response)
 
 
-def log_exposed(flashlights: Flashlights, evidence: Evidence) -> Samples:
-    """Return the log of light times exposure; the response is stated about its median over the series."""
-    light = log_irradiance(flashlights, evidence)
-    return light if evidence.exposure is None else light + evidence.exposure[:, None]
+def _log_exposed(flashlights: Flashlights, evidence: Evidence) -> Samples:
+    """Return the log of light times exposure about its median over the series, as the response is stated."""
+    light = log_irradiance(flashlights, evidence) + (0.0 if evidence.exposure is None else evidence.exposure[:, None])
+    return light - np.median(light)
 
 
 def cosines(flashlights: Flashlights, evidence: Evidence) -> Samples:
@@ -242,8 +242,7 @@ def jacobian(flashlights: Flashlights, evidence: Evidence):
     shared = [by_term * share[..., None], np.stack([np.ones_like(total), *by_wall], -1) / total[..., None]]
     if not len(flashlights.response):
         return flashlight, np.concatenate(shared, -1)
-    light = log_exposed(flashlights, evidence)
-    light = light - np.median(light)
+    light = _log_exposed(flashlights, evidence)
     slope = 1 + (slopes(light) @ flashlights.response)[..., None]
     return flashlight * slope, np.concatenate([*(slope * one for one in shared), integrals(light)], -1)
 

@@ -17,15 +17,17 @@ from calibration.flashlight.fit import (
     MIN_GROUND,
     FlashlightFit,
     does_not_follow,
+    thinned,
 )
-from calibration.flashlight.joint_search import CONTRASTS, at_best_contrast, searched
+from calibration.flashlight.joint_search import searched, settled
 from calibration.flashlight.model import (
     Evidence,
     Flashlights,
     normal_equations,
 )
+from calibration.flashlight.pictured import bent
 from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
-from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows, find_shadows, of_one_ground
+from calibration.ground.ground_shadows import GroundShadows, find_shadows, of_one_ground
 from calibration.ground.mirror_highlights import find_highlights
 from calibration.ground.table_edges import TableEdge
 from calibration.lights.ground_cells import beyond_ends, ground_points
@@ -38,8 +40,6 @@ from capture.photos.photo import PhotoStack
 
 LOG = logging.getLogger(__name__)
 OUTLINE_SIDE = 504  # px: grain and noise of larger pictures make outlines ragged, smaller ones make them coarse
-THIN = 4  # every fourth ground cell: misfits are smooth over many
-LIT = 0.85  # visibility from which a cell's brightness counts
 FEWEST_WHOLE = 8  # photos whose shadows the picture does not cut
 OUTLINES_WRONG = 1 / 3  # of the trusted photos at odds: more than are ever bad, so the object's outline is wrong, ...
 REPAIRED = 0.5  # ... and its hull is right if it leaves less than this share of them at odds
@@ -71,18 +71,17 @@ def with_outlines(
     if terms is None:
         return None
     starts = [*shadow_starts(terms.maps, shadows.object_mask, posed_camera), by_shading.positions]
-    cells = replace(_lit_cells(evidence, shadows, posed_camera), outlines=terms, exposure=None)
-    fit = searched(starts, cells)
+    cells, by_shading = replace(thinned(evidence), outlines=terms), bent(by_shading, evidence)
+    fit = searched(starts, by_shading, cells)
     wide = _terms(coarse, field, shadows, posed_camera, cues, True) if _at_odds(fit, terms) > OUTLINES_WRONG else None
     if wide is not None and _at_odds(fit, wide) < REPAIRED * _at_odds(fit, terms):
         terms = wide
-        fit = searched([fit.flashlights.positions], replace(cells, outlines=wide))
-    if _ground(fit) < MIN_GROUND / THIN:
+        fit = searched([], fit.flashlights, replace(cells, outlines=wide))
+    if _ground(fit) < MIN_GROUND:
         return None
     # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share
     agreeing = replace(cells, outlines=replace(terms, trusted=~_contradicts(fit)))
-    found = at_best_contrast(fit.flashlights, agreeing, (1.0,) if stack.is_linear else CONTRASTS)
-    return replace(found, between=found.between + fit.between) if _ground(found) >= MIN_GROUND / THIN else None
+    return replace(settled(fit.flashlights, agreeing), between=fit.between)
 
 
 def outlines_of(
@@ -154,13 +153,3 @@ def outline_sigma(fit: FlashlightFit) -> Float[np.ndarray, "photos 3"]:
     variance = np.diag(covariance)[: own * n].reshape(n, own)[:, :3]
     reach = np.linalg.norm(fit.flashlights.positions - fit.evidence.cells.centre, axis=1, keepdims=True)
     return np.sqrt(np.maximum(variance, 0) + (ROUNDED * reach) ** 2 / 3 + fit.between)
-
-
-def _lit_cells(evidence: Evidence, shadows: GroundShadows, posed_camera: PosedCamera) -> Evidence:
-    """Keep every THIN-th ground cell, and of its samples those that are lit ground."""
-    height, width = shadows.object_mask.shape
-    thin = evidence.at(np.arange(0, len(evidence.cells.points), THIN))
-    pixels = np.rint(posed_camera.resized(width, height).project(thin.cells.points)).astype(int)
-    column, row = np.clip(pixels[:, 0], 0, width - 1), np.clip(pixels[:, 1], 0, height - 1)
-    lit = (shadows.visibility[:, row, column] > LIT) & (shadows.likelihood[row, column] < GROUND_LIKE)
-    return replace(thin, weight=thin.weight * lit)

@@ -1,6 +1,6 @@
 """Outlines, and what else geometry says of the lights, as residuals in a least-squares fit of these lights."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -28,6 +28,7 @@ class OutlineTerms:
     trusted: Bool[np.ndarray, " used"]  # of the fit's photos: the others neither prove space empty nor count
     highlights: MirrorHighlights | None = None  # numbered as the maps' photos
     blur: float = 1.0  # factor of an outline's sigma, for a search that begins far from the answer
+    every: int = 1  # only each so manieth ray is looked at, which then counts for those left out
     _looks: list[tuple[np.ndarray, np.ndarray, Residuals]] = field(default_factory=list, init=False)
 
     def rows(self, positions: Float[np.ndarray, "used 3"]):
@@ -37,7 +38,7 @@ class OutlineTerms:
         sigma = PIXEL_ERROR * self.maps.pixel * self.blur
         active = found.emptiness > 0
         size = found.emptiness[active] / sigma
-        root = np.sqrt(cauchy(size**2) / SAME)
+        root = np.sqrt(cauchy(size**2) * self.every / SAME)
         slopes = np.zeros((len(size), len(positions) + 1, 3))
         place = np.arange(len(size))
         slopes[place, order[found.owner[active]]] += found.d_owner[active] * (root / sigma)[:, None]
@@ -51,6 +52,13 @@ class OutlineTerms:
         bent[np.arange(len(miss)), :, owner] = bend * vote[:, None, None]
         value = np.concatenate([root * size, far, (miss * vote[:, None]).ravel()])
         return value, np.concatenate([slopes[:, :-1], toward, bent.reshape(-1, len(positions), 3)])
+
+    def thinned(self, every: int) -> "OutlineTerms":
+        """Return the terms with each so manieth ray only: neighbours are wrong together, and a search has many."""
+        maps, some = self.maps, slice(None, None, every)
+        first = maps.first_height[some].copy()
+        maps = replace(maps, starts=maps.starts[some], owner=maps.owner[some], first_height=first)
+        return replace(self, maps=maps, every=every)
 
     def misfit(self, positions: Float[np.ndarray, "used 3"]) -> Float[np.ndarray, " used"]:
         """Return the 90th percentile of the emptiness of each photo's rays, px; 0 for a photo without rays.
@@ -71,7 +79,7 @@ class OutlineTerms:
         """Return half the sum of squares whose weighted rows `rows` gives: Cauchy's function."""
         found = self._look(positions, self.trusted)
         size = np.maximum(found.emptiness, 0) / (PIXEL_ERROR * self.maps.pixel * self.blur)
-        return float(np.log1p(size**2).sum() / (2 * SAME)) + self.other_cost(positions)
+        return float(np.log1p(size**2).sum() * self.every / (2 * SAME)) + self.other_cost(positions)
 
     def other_cost(self, positions: Float[np.ndarray, "used 3"]) -> float:
         """Half the sum of squares of unusual distances, and Geman and McClure's function of highlights.
