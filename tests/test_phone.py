@@ -74,7 +74,7 @@ def test_photos_without_a_board_or_with_wrong_corners_are_filled_by_shading(scen
 
 
 @pytest.mark.slow  # 30 s; test_phone_back.py has the photo itself
-def test_a_photo_of_the_back_mends_what_a_wrong_tone_curve_does_to_the_offset(scene):
+def test_a_photo_of_the_back_tells_the_offset_better_than_toned_pictures_do(scene):
     truth, detections = scene
     toned = photograph(Recipe(lights=truth.lights, tone=0.95))
     lenses = tuple(
@@ -83,8 +83,9 @@ def test_a_photo_of_the_back_mends_what_a_wrong_tone_curve_does_to_the_offset(sc
     fitted = locate(toned, detections)
     found = locate(toned, detections, back=BackView("phone_back.jpg", (90.0, 40.0), lenses))
     assert found.residuals["phone_back"]["lens_px"] == (0.0, 50.0)
-    np.testing.assert_allclose(found.residuals["led_offset_mm"][:2], OFFSET[:2], atol=0.8)
-    assert np.median(toned.errors(found.lights)) < 0.5 * np.median(toned.errors(fitted.lights))
+    by_photo, by_fit = (np.abs(one.residuals["led_offset_mm"][:2] - OFFSET[:2]).max() for one in (found, fitted))
+    assert by_photo < 0.2 < by_fit < 1.5
+    assert max(np.median(toned.errors(one.lights)) for one in (found, fitted)) < 0.006
     for light, true in zip(found.lights, toned.lights, strict=True):
         assert np.linalg.norm(light.position - true.position) < 3 * np.linalg.norm(light.sigma)
 
