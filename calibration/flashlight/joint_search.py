@@ -76,19 +76,18 @@ def searched(
     lines = [_settled(by_shading, few, _judged(by_shading, few, few.weight)[2])]
     for number, one in enumerate(starts):
         LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", number + 1, len(starts))
-        lines.append(_likeliest(_fitted(_moved(replace(plain, positions=one), few), few), few))
+        lines.append(_likeliest(_fitted(_moved(replace(plain, positions=one), few), few), few, 1)[0])
     found = list(lines)
     for number in range(ROUNDS):
         LOG.info("fitting lights to outlines of shadows and shading, round %d of at most %d", number + 1, ROUNDS)
         before = _posteriors(lines, few).min()
         for line, best in enumerate(lines):
-            new = _improved(best, sorted(found, key=lambda one: _posteriors([one], few)[0])[:COMPARED], few)
-            lines[line] = _likeliest([best, *new], few)
+            new = _improved(best, _likeliest(found, few, COMPARED), few)
+            lines[line] = _likeliest([best, *new], few, 1)[0]
             found += new
-        posterior = _posteriors(lines, few)
-        if len(lines) == 1 and before - posterior[0] < GAINED:
+        if len(lines) == 1 and before - _posteriors(lines, few)[0] < GAINED:
             break
-        lines = [lines[k] for k in posterior.argsort()[: max(len(lines) // 2, 1)]]
+        lines = _likeliest(lines, few, max(len(lines) // 2, 1))
     (best,) = lines
     posterior = _posteriors(found, few)
     places = np.stack([one[1].flashlights.positions for one in found])
@@ -138,8 +137,8 @@ def _shaded(like: Flashlights, places: Float[np.ndarray, "photos 3"], wall: Wall
 
 def _fitted(tried: Sequence[_Found], evidence: Evidence) -> list[_Found]:
     """Return fits from the most probable of the states that were tried."""
-    order = _posteriors(tried, evidence).argsort()[:TRIED]
-    return [_settled(tried[k][1].flashlights, evidence, tried[k][2]) for k in order]
+    best = _likeliest(tried, evidence, TRIED)
+    return [_settled(fit.flashlights, evidence, misfit) for _, fit, misfit in best]
 
 
 def farther(
@@ -201,8 +200,8 @@ def _posteriors(found: Sequence[_Found], evidence: Evidence) -> Float[np.ndarray
     return np.array([one[0] for one in found]) + cells * np.log(misfit) + walls * WALL_TERMS / 2 * np.log(cells)
 
 
-def _likeliest(found: Sequence[_Found], evidence: Evidence) -> _Found:
-    return found[int(_posteriors(found, evidence).argmin())]
+def _likeliest(found: Sequence[_Found], evidence: Evidence, count: int) -> list[_Found]:
+    return [found[k] for k in _posteriors(found, evidence).argsort(kind="stable")[:count]]
 
 
 def _settled(start: Flashlights, evidence: Evidence, misfit: float) -> _Found:

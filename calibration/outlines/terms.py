@@ -28,7 +28,7 @@ class OutlineTerms:
     trusted: Bool[np.ndarray, " used"]  # of the fit's photos: the others neither prove space empty nor count
     highlights: MirrorHighlights | None = None  # numbered as the maps' photos
     blur: float = 1.0  # factor of an outline's sigma, for a search that begins far from the answer
-    every: int = 1  # only each so manieth ray is looked at, which then counts for those left out
+    every: int = 1  # one ray in so many is looked at, and counts for those left out
     _looks: list[tuple[np.ndarray, np.ndarray, Residuals]] = field(default_factory=list, init=False)
 
     def rows(self, positions: Float[np.ndarray, "used 3"]):
@@ -54,7 +54,7 @@ class OutlineTerms:
         return value, np.concatenate([slopes[:, :-1], toward, bent.reshape(-1, len(positions), 3)])
 
     def thinned(self, every: int) -> "OutlineTerms":
-        """Return the terms with each so manieth ray only: neighbours are wrong together, and a search has many."""
+        """Return the terms with one ray in so many: neighbours are wrong together, and a search has many."""
         maps, some = self.maps, slice(None, None, every)
         first = maps.first_height[some].copy()
         maps = replace(maps, starts=maps.starts[some], owner=maps.owner[some], first_height=first)
