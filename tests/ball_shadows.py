@@ -33,10 +33,10 @@ def ball_lights(count: int = 14) -> np.ndarray:
     return distance[:, None] * direction
 
 
-def hits_ball(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def hits_ball(start: np.ndarray, end: np.ndarray, radius: float = RADIUS) -> np.ndarray:
     """Whether the line from start to end comes nearer to the ball's middle than its radius."""
     along = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
-    return np.linalg.norm(np.cross(MIDDLE - start, along), axis=-1) < RADIUS
+    return np.linalg.norm(np.cross(MIDDLE - start, along), axis=-1) < radius
 
 
 def photographed() -> tuple[PosedCamera, np.ndarray, GroundField, GroundShadows]:

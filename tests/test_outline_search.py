@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ball_shadows import EYE, RADIUS, drawn
+from ball_shadows import EYE, RADIUS, ball_camera, drawn, hits_ball, photographed
 
 from calibration.flashlight import joint_search, outline_lights
 from calibration.flashlight.fit import ALIKE_POWER, FlashlightFit, does_not_follow, variance_about
@@ -73,6 +73,20 @@ def test_a_wall_is_found_where_one_is_and_nowhere_else(ball, wall):
     if wall[2] > 0:
         assert abs(np.angle(np.exp(1j * (found.wall[0] - wall[0])))) < 0.3
     assert (found.wall[2] > 0.2) == (wall[2] > 0)
+
+
+def test_what_the_camera_sees_of_the_object_and_its_shadows_is_no_ground(ball):
+    """Cells at an outline see both: they are left out around the object, and count as what their middle shows."""
+    _, lights, maps = ball
+    evidence = _shaded(maps, lights)
+    points = evidence.cells.points
+    weight = outline_lights._bare_ground(evidence, photographed()[3], maps, ball_camera()).weight
+    assert (weight[:, hits_ball(np.broadcast_to(EYE, points.shape), points)] == 0).all()
+    clear = ~hits_ball(np.broadcast_to(EYE, points.shape), points, 1.6 * RADIUS)
+    for light, row, before in zip(lights, weight, evidence.weight, strict=True):
+        np.testing.assert_array_equal(row[clear & ~hits_ball(points, light, 1.1 * RADIUS)] > 0, True)
+        np.testing.assert_array_equal(row[clear & hits_ball(points, light, 0.9 * RADIUS)], 0)
+        np.testing.assert_array_equal(row[row > 0], before[row > 0])
 
 
 @pytest.mark.parametrize("times", [0.7, 1.2, 1.5])

@@ -1,6 +1,6 @@
 """All lights from outlines of shadows and the shading of all photos together, from rough starts.
 
-The work is bounded: outlines alone from each start, then a few fits to both at other distances and with other walls.
+The work is bounded: outlines alone from each start, then a few fits to both in rounds, of other distances and walls.
 Photos that are at odds add none.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from calibration.flashlight.beam_profile import EXTRA_TERMS
+from calibration.flashlight.beam_profile import EXTRA_TERMS, SMOOTH_TERMS
 from calibration.flashlight.descent import refine
 from calibration.flashlight.fit import (
     ALIKE_POWER,
@@ -38,11 +38,11 @@ NO_GROUND = 1e-6  # log units: a misfit of less is that of no cell
 LOST = 1e9  # the cost of lights that no ground follows
 SCATTER = 30.0  # of the negative log posterior between searches by other steps: it has many small minima
 FARTHER = (0.5, 0.6, 0.72, 0.85, 1.0, 1.18, 1.4, 1.65, 2.0)  # along what outlines leave free: a hand's range
-ROUNDS = 6  # of other walls and distances, at most
-EVERY = 3  # of the cells, and of the outlines' rays: neighbours err together
+HOPS = (0.7, 0.85, 1.18, 1.4)  # likewise, from a fit on: half a stop and one, of what the ground receives
+ROUNDS = 10  # of other walls and distances, at most
+EVERY = 4  # of the cells, and of the outlines' rays: neighbours err together (SAME of outlines.terms)
 COMPARED = 4  # fits, of which a light is taken from where it explains its photo best
-TRIED = 2  # of a round's: those that are fitted
-GAINED = 1.0  # of the negative log posterior: a round that lowers it less is the last
+GAINED = 3.0  # of the negative log posterior, strong evidence [Kass and Raftery 1995]: a last round lowers it less
 NEAR_INFINITY = 0.05  # a light that would be moved 20 times as far stays
 # tried first: as near as a wall behind a thing stands (mm), of middle grey; the fit moves them
 WALLS = tuple(np.array([azimuth, np.log(hand.NEAREST * 1.4), 0.5]) for azimuth in np.arange(8) * np.pi / 4)
@@ -76,7 +76,7 @@ def searched(
     lines = [_settled(by_shading, few, _judged(by_shading, few, few.weight)[2])]
     for number, one in enumerate(starts):
         LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", number + 1, len(starts))
-        lines.append(_likeliest(_fitted(_moved(replace(plain, positions=one), few), few), few, 1)[0])
+        lines.append(_begun(replace(plain, positions=one), few))
     found = list(lines)
     for number in range(ROUNDS):
         LOG.info("fitting lights to outlines of shadows and shading, round %d of at most %d", number + 1, ROUNDS)
@@ -96,11 +96,13 @@ def searched(
 
 
 def _improved(best: _Found, found: Sequence[_Found], evidence: Evidence) -> list[_Found]:
-    """Return fits from the best one at other distances, with a wall, and with lights of the others that were found."""
+    """Return fits from the best one with a wall, at another distance, and with lights of the others that were found."""
     state = best[1].flashlights
-    tried = [_shaded(state, state.positions, wall, evidence) for wall in WALLS if state.wall[2] <= 0]
-    mixed = _best_of_each(best, found, evidence)
-    return [*_fitted([*tried, *_moved(state, evidence)], evidence), _settled(mixed, evidence, best[2])]
+    walled = [_shaded(state, state.positions, wall, evidence) for wall in WALLS if state.wall[2] <= 0]
+    hops = [one for times in HOPS for one in _both(state, farther(state.positions, evidence, times), evidence)]
+    tried = [*_likeliest(walled, evidence, 1), *_likeliest(hops, evidence, 1)]
+    mixed = _settled(_best_of_each(best, found, evidence), evidence, best[2])
+    return [mixed, *(_settled(fit.flashlights, evidence, misfit) for _, fit, misfit in tried)]
 
 
 def settled(start: Flashlights, evidence: Evidence) -> FlashlightFit:
@@ -122,10 +124,22 @@ def _by_outlines(start: Flashlights, evidence: Evidence) -> Flashlights:
     return start
 
 
-def _moved(state: Flashlights, evidence: Evidence) -> list[_Found]:
-    """Return the state with its lights where outlines alone lead them, and at other distances."""
-    places = _by_outlines(state, evidence).positions
-    return [_shaded(state, farther(places, evidence, times), state.wall, evidence) for times in FARTHER]
+def _begun(start: Flashlights, evidence: Evidence) -> _Found:
+    """Return the best of two fits from where outlines alone lead the lights, each at the likeliest distance."""
+    places = _by_outlines(start, evidence).positions
+    tried = [_both(start, farther(places, evidence, times), evidence) for times in FARTHER]
+    best = [_likeliest(same, evidence, 1)[0] for same in zip(*tried, strict=True)]
+    return _likeliest([_settled(fit.flashlights, evidence, misfit) for _, fit, misfit in best], evidence, 1)[0]
+
+
+def _both(like: Flashlights, places: Float[np.ndarray, "photos 3"], evidence: Evidence) -> tuple[_Found, _Found]:
+    """Return the state with such places, shaded from its own beam and response, and by a smooth beam without response.
+
+    Rings and response stand in for what is wrong with places far off; few terms lead to places nearer the truth.
+    """
+    smooth = replace(like, positions=places, beam=like.beam[:SMOOTH_TERMS], response=np.zeros(0))
+    smooth, weight = refine(smooth, replace(evidence, outlines=None), ALIKE_POWER, places_held, FAR[:6])
+    return _shaded(like, places, like.wall, evidence), _judged(bent(smooth, evidence), evidence, weight)
 
 
 def _shaded(like: Flashlights, places: Float[np.ndarray, "photos 3"], wall: Wall, evidence: Evidence) -> _Found:
@@ -133,12 +147,6 @@ def _shaded(like: Flashlights, places: Float[np.ndarray, "photos 3"], wall: Wall
     state = replace(like, positions=places, wall=wall)
     state, weight = refine(state, replace(evidence, outlines=None), ALIKE_POWER, places_held, FAR[:6])
     return _judged(state, evidence, weight)
-
-
-def _fitted(tried: Sequence[_Found], evidence: Evidence) -> list[_Found]:
-    """Return fits from the most probable of the states that were tried."""
-    best = _likeliest(tried, evidence, TRIED)
-    return [_settled(fit.flashlights, evidence, misfit) for _, fit, misfit in best]
 
 
 def farther(

@@ -10,6 +10,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -30,9 +31,9 @@ from calibration.ground.ground_field import GroundField, at_photo_size, fit_grou
 from calibration.ground.ground_shadows import GroundShadows, find_shadows, of_one_ground
 from calibration.ground.mirror_highlights import find_highlights
 from calibration.ground.table_edges import TableEdge
-from calibration.lights.ground_cells import beyond_ends, ground_points
+from calibration.lights.ground_cells import CELL, beyond_ends, ground_points
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
-from calibration.outlines.outline_maps import outline_maps, with_cues
+from calibration.outlines.outline_maps import OutlineMaps, outline_maps, with_cues
 from calibration.outlines.shadow_start import shadow_starts
 from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
 from calibration.posed_camera import PosedCamera
@@ -71,7 +72,8 @@ def with_outlines(
     if terms is None:
         return None
     starts = [*shadow_starts(terms.maps, shadows.object_mask, posed_camera), by_shading.positions]
-    cells, by_shading = replace(thinned(evidence), outlines=terms), bent(by_shading, evidence)
+    bare = _bare_ground(evidence, shadows, terms.maps, posed_camera)
+    cells, by_shading = replace(thinned(bare), outlines=terms), bent(by_shading, evidence)
     fit = searched(starts, by_shading, cells)
     wide = _terms(coarse, field, shadows, posed_camera, cues, True) if _at_odds(fit, terms) > OUTLINES_WRONG else None
     if wide is not None and _at_odds(fit, wide) < REPAIRED * _at_odds(fit, terms):
@@ -82,6 +84,26 @@ def with_outlines(
     # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share
     agreeing = replace(cells, outlines=replace(terms, trusted=~_contradicts(fit)))
     return replace(settled(fit.flashlights, agreeing), between=fit.between)
+
+
+def _bare_ground(evidence: Evidence, shadows: GroundShadows, maps: OutlineMaps, posed_camera: PosedCamera) -> Evidence:
+    """Return the evidence without cells that see the object, and without samples in its shadow.
+
+    Robust weights tell the object from the ground by its shading. In a close-up it is a third of all cells, and beam,
+    rings and response then follow both.
+    """
+    height, width = shadows.object_mask.shape
+    camera, points = posed_camera.resized(width, height), evidence.cells.points
+    side = 2 * round(CELL / 2 * camera.camera.fx) + 1  # as wide as a cell is seen: cells at the outline see both
+    thing = cv2.dilate(shadows.object_mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+    column, row = camera.project(points).round().astype(int).T
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    is_thing = inside & thing[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    place = np.floor((points[:, :2] - maps.corner) / maps.cell).astype(int)
+    seen = ((place >= 0) & (place < maps.dark.shape[1])).all(1)
+    weight = np.where(is_thing, 0.0, evidence.weight)
+    weight[:, seen] *= ~maps.dark[:, place[seen, 0], place[seen, 1]]
+    return replace(evidence, weight=weight)
 
 
 def outlines_of(
