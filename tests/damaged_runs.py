@@ -21,6 +21,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
 from strange_runs import STRANGE, by_change
+from test_untrusted_files import Payload, png, tiff
 
 from calibration.calibrated_views import CalibratedView, CalibratedViews, save_views
 from calibration.calibration import Calibration, load_calibration, save_calibration
@@ -196,29 +197,6 @@ def exchanged(draw: random.Random, document: Any) -> tuple[Any, str]:
         return document, f"{way} = {value!r:.30}"
 
 
-def by_markup(draw: random.Random, run: Path) -> str:
-    """Every text of a JSON file, or of the log, becomes markup."""
-    if draw.random() < 0.3:
-        lines = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
-        texts = [{"message": MARKUP, "numbers": {f"loss_{MARKUP}": 1.0}}, {"stage": MARKUP}]
-        lines += [lines[-1] | draw.choice(texts)]
-        (run / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-        return "log.jsonl: markup"
-    path = _chosen(draw, run, JSON)
-    kept = {"mm", "scene", "point", "directional", "pinhole", "lit"}
-
-    def marked(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: marked(entry) for key, entry in value.items()}
-        if isinstance(value, list):
-            return [marked(entry) for entry in value]
-        is_changed = isinstance(value, str) and value not in kept and draw.random() < 0.5
-        return MARKUP.replace("/", "") if is_changed else value
-
-    _write(path, marked(json.loads(path.read_text())))
-    return f"{path.name}: markup"
-
-
 def by_numbers(draw: random.Random, run: Path) -> str:
     """Numbers of a tensor that no scene has, or noise."""
     path = _chosen(draw, run, TENSORS)
@@ -299,16 +277,6 @@ def by_mesh(draw: random.Random, run: Path) -> str:
     return f"{path.name}: {way}"
 
 
-class Payload:
-    """Unpickling it makes a folder, which nobody else does."""
-
-    def __init__(self, path: Path):
-        self.path = path
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.path),)
-
-
 def by_map(draw: random.Random, run: Path) -> str:
     """A pickle in the place of numbers, another shape or type, numbers that are none."""
     path = run / draw.choice(MAPS)
@@ -354,15 +322,11 @@ def by_kind(draw: random.Random, run: Path) -> str:
 
 @cache
 def _large_png(edge: int, size: int) -> bytes:
-    from test_untrusted_files import png
-
     return png(edge, edge, bytes(size))
 
 
 def by_picture(draw: random.Random, run: Path) -> str:
     """A picture of another format, of 30,000 x 30,000 pixels, or a folder of them that leads elsewhere."""
-    from test_untrusted_files import png, tiff
-
     path = _chosen(draw, run, PICTURES)
     way = draw.choice(["bomb", "tiff", "svg", "other size", "link"])
     if way == "bomb":
@@ -397,7 +361,7 @@ def by_log(draw: random.Random, run: Path) -> str:
 
 
 WAYS: tuple[Callable[[random.Random, Path], str], ...] = (
-    *(by_bytes, by_bytes, by_value, by_value, by_value, by_markup, by_numbers, by_numbers, by_shape, by_header),
+    *(by_bytes, by_bytes, by_value, by_value, by_value, by_numbers, by_numbers, by_shape, by_header),
     *(by_header, by_mesh, by_map, by_kind, by_kind, by_picture, by_log),
     *STRANGE,
 )

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from flashlight_photos import POSED_CAMERA, Recipe, photograph
 
-from calibration.flashlight.fit import collect, first_fits, fit_flashlights, variance_about
-from calibration.flashlight.light_estimate import locate_lights
+from calibration.flashlight.fit import collect, first_fits, fit_flashlights
 from calibration.flashlight.model import Evidence, Flashlights, _model, cell_residuals, free_tangent, jacobian
 from calibration.flashlight.pictured import as_pictured, bent, with_response
 from calibration.lights.response import TERMS, bend, integrals, slopes
@@ -93,16 +92,3 @@ def test_beam_and_powers_are_told_as_the_pictures_show_them(truth, evidence):
     shown = as_pictured(fit)
     assert shown.flashlights.response.size == 0
     np.testing.assert_array_equal(shown.flashlights.positions, fit.flashlights.positions)
-
-
-@pytest.mark.slow
-def test_files_on_another_curve_than_srgb_are_covered_by_the_stated_sigmas(truth):
-    found = locate_lights(replace(truth.stack, rgb=truth.stack.rgb**1.1), POSED_CAMERA, np.ones(12, bool))
-    assert truth.share_inside(found.lights) > 0.9
-
-
-def test_the_variance_of_a_mixture_is_about_the_fit_that_is_chosen():
-    places = np.array([[[0.0, 0.0, 1.0]], [[0.0, 0.0, 3.0]]])
-    about_first = variance_about(places[0], places, np.array([1.0, 1.0]))
-    np.testing.assert_allclose(about_first, [[0.0, 0.0, 2.0]])
-    assert variance_about(places[0], places, np.array([1.0, 1e-6])).max() < 1e-5

@@ -1,7 +1,5 @@
 """Camera and shadow rays of the trainer on a ball, against geometry; its losses where the truth is known."""
 
-import math
-
 import pytest
 import torch
 from torch import Tensor, nn
@@ -15,9 +13,8 @@ from reconstruct.shadowneus.camera_rays import (
     light_left_telescoped,
     place_samples,
 )
-from reconstruct.shadowneus.config import ABLATIONS, ShadowSamples, TrainConfig, ablated, shortened_training
+from reconstruct.shadowneus.config import ShadowSamples
 from reconstruct.shadowneus.train_step import bound_loss, contain_loss
-from reconstruct.shadowneus.trainer import learning_factor
 from reconstruct.torch_sdf import equations as render
 
 RADIUS, GROUND, BOUND = 0.6, -0.6, 2.0
@@ -143,25 +140,3 @@ def test_the_known_ground_and_an_object_inside_the_sphere_cost_nothing():
     contain, _ = contain_loss(field, rays, hits, on_ball, BOUND, generator())
     bound, wrong = bound_loss(field, 500, BOUND, GROUND, generator(), torch.device("cpu"))
     assert float(contain.detach()) < 1e-6 and float(bound.detach()) == 0 and not len(wrong)
-
-
-def test_the_learning_rate_warms_up_and_falls_to_its_last_value():
-    config = TrainConfig()
-    assert learning_factor(0, config) == 1 / 5000
-    assert learning_factor(5000, config) == 1.0
-    assert math.isclose(learning_factor(150_000, config), 0.05)
-    middle = learning_factor(77_500, config)
-    assert math.isclose(middle, 0.525)
-
-
-def test_a_shorter_training_keeps_the_shape_of_its_schedule():
-    short = shortened_training(TrainConfig(), 1500)
-    assert (short.warm_up, short.cosine_anneal, short.foreground_anneal) == (50, 250, 50)
-    assert short.resolutions == ((0, 8), (50, 4), (100, 2), (150, 1))
-
-
-@pytest.mark.parametrize("name", ABLATIONS)
-def test_every_ablation_changes_one_setting(name):
-    base = TrainConfig(use_telescoped=name == "sampled")
-    changed = ablated(base, name)
-    assert sum(getattr(base, key) != getattr(changed, key) for key in vars(base)) == 1
