@@ -20,7 +20,7 @@ from fuzz_images import DAMAGES
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
-from strange_runs import STRANGE, by_change
+from strange_runs import DOCUMENTS, MARKUP, STRANGE, by_change
 from test_untrusted_files import Payload, png, tiff
 
 from calibration.calibrated_views import CalibratedView, CalibratedViews, save_views
@@ -35,13 +35,11 @@ from reconstruct.mesh.mesh import extract_mesh, save_mesh
 from reconstruct.solve.checkpoint import write_checkpoint
 from viewer.stage.pack_file import write_stage
 
-MARKUP = "<script>alert('shadowgraph')</script><img src=x onerror=alert(1)>&\"'"  # text that must stay text
-JSON = ("calibration.json", "report.json", "manifest.json", "check.json", "config.json", "memory.json", "stage.json")
 TENSORS = ("fields.safetensors", "detail.safetensors", "checkpoint.safetensors")
 MAPS = ("depth.npy", "normal.npy")
 MESHES = ("mesh.ply", "preview.ply", "hull.ply")
 PICTURES = ("mask.png", "thumbs/*.jpg")
-FILES = (*JSON, *TENSORS, *MAPS, *MESHES, *PICTURES, "log.jsonl", "lock", "stage.zip")
+FILES = (*DOCUMENTS, *TENSORS, *MAPS, *MESHES, *PICTURES, "log.jsonl", "lock", "stage.zip")
 VALUES = (None, True, -1, 0, 1, 1e308, -1e308, 1e-308, 1e13, float("nan"), float("inf"), 2**70, [], {}, [[1]], [0] * 4)
 VALUES += ("", "x" * 300, "x" * 100_000, "../../etc/passwd", "/etc/passwd", "a\0b", "a\nb\x1b[2J", MARKUP)
 NUMBERS = (float("nan"), float("inf"), -float("inf"), 1e30, -1e30, 0.0, 1e-30, 6e4)
@@ -168,7 +166,7 @@ def by_bytes(draw: random.Random, run: Path) -> str:
 
 def by_value(draw: random.Random, run: Path) -> str:
     """One value of a JSON file exchanged, removed, or repeated."""
-    path = _chosen(draw, run, JSON)
+    path = _chosen(draw, run, DOCUMENTS)
     document, said = exchanged(draw, json.loads(path.read_text()))
     _write(path, document)
     return f"{path.name}: {said}"

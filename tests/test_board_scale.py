@@ -11,7 +11,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from calibration.board.board import Board, parse_board
 from calibration.board.board_photos import fit_board
-from calibration.board.board_scale import scale_of, scale_parts, scale_sentence
+from calibration.board.board_scale import scale_parts, scale_sentence
 from calibration.camera import Camera
 from capture.session.session import Session
 
@@ -83,19 +83,6 @@ def test_a_board_of_its_true_size_is_not_doubted_whatever_the_file_says(tmp_path
     residuals, doubts = found(tmp_path, spec, tags)
     assert doubts == []
     assert ("assumed" in scale_sentence(residuals)) == (spec is None)
-
-
-@pytest.mark.parametrize(
-    ("spec", "is_named", "said"),
-    [
-        ("charuco:5x7:30:22:DICT_4X4_50", True, "one square = 30 mm, as you typed it"),
-        ("charuco:7x9:25:18:DICT_4X4_50", True, "one square = 25 mm, from the board's print"),
-        ("checkerboard:9x6:22.5", False, "one square = 22.5 mm, which is assumed"),
-        ("paper:A4", True, "paper:A4 = 297 x 210 mm, as such sheets"),
-    ],
-)
-def test_what_every_length_rests_on_is_one_sentence(spec, is_named, said):
-    assert said in scale_sentence({"scale": scale_of(parse_board(spec), is_named)})
 
 
 @pytest.mark.parametrize("entry", [None, 3, {"length": 1, "from": "x"}, {"length": "x"}])

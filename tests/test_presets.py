@@ -2,13 +2,28 @@
 
 from dataclasses import asdict, replace
 
+import pytest
 from synthetic import BALL, Look, render
 
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import restricted, supervise
 from reconstruct.run.presets import preset, training, without
 from reconstruct.sdf import kernels
+from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.source.source import RunOptions
+
+
+def test_the_paper_s_preset_is_the_paper_s_settings():
+    long_side, config = training("paper", "auto", None, 0)
+    assert (long_side, config) == (800, TrainConfig())
+    # [ShadowNeuS, "Implementation details" and supplement]
+    assert (config.iterations, config.pixels, config.lights, config.camera_steps) == (150_000, 256, 4, 256)
+    assert (config.network.depth, config.network.width, config.network.frequencies) == (8, 256, 6)
+    assert (config.network.material_depth, config.network.features) == (4, 256)
+    assert (config.samples.uniform + config.samples.near, config.samples.importance) == (80, 64)
+    assert (config.learning_rate, config.last_learning_rate * config.learning_rate) == (1e-3, pytest.approx(5e-5))
+    assert (config.warm_up, config.weights.eikonal) == (5_000, 0.01)
+    assert config.resolutions[0] == (0, 8) and config.resolutions[-1][1] == 1  # 100 px of 800 at first
 
 
 def test_an_ablation_is_one_setting_of_either_solver():

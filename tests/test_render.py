@@ -42,6 +42,22 @@ def test_the_closed_form_is_the_limit_of_the_sampled_one():
     torch.testing.assert_close(render.transmittance(sdf, 7.0)[:1], closed, atol=1e-4, rtol=1e-4)
 
 
+def test_every_equation_passes_gradcheck():
+    g = torch.Generator().manual_seed(1)
+
+    def leaf(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g, dtype=torch.float64).requires_grad_()
+
+    check = torch.autograd.gradcheck
+    assert check(lambda x: render.opacity_from_sdf(x, 3.0), leaf(4, 6))
+    assert check(lambda x: render.transmittance(x, 3.0), leaf(4, 6))
+    assert check(lambda a, b: render.transmittance_from_extrema(a, b, 3.0), (leaf(4, 2), leaf(4, 2)))
+    assert check(render.moved_intersection, (leaf(4, 3), leaf(4, 3), leaf(4), leaf(4, 3)))
+    assert check(lambda m: render.area_ratio(m - 0.5, torch.full((4,), 4.0).double()), leaf(4))
+    assert check(render.shade, (leaf(4, 3), leaf(4, 3), leaf(4, 3), leaf(4, 3), leaf(4)))
+    assert check(lambda x: render.shadow_loss(0.1 + 0.8 * x, torch.full((4,), 0.3).double()), leaf(4))
+
+
 def test_kernel_transmittance_equals_dense_sampling():
     grid = ball_grid()
     starts, ends = random_rays(400)

@@ -1,5 +1,7 @@
 """Camera and shadow rays of the trainer on a ball, against geometry; its losses where the truth is known."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor, nn
@@ -13,8 +15,9 @@ from reconstruct.shadowneus.camera_rays import (
     light_left_telescoped,
     place_samples,
 )
-from reconstruct.shadowneus.config import ShadowSamples
+from reconstruct.shadowneus.config import ShadowSamples, TrainConfig
 from reconstruct.shadowneus.train_step import bound_loss, contain_loss
+from reconstruct.shadowneus.trainer import learning_factor
 from reconstruct.torch_sdf import equations as render
 
 RADIUS, GROUND, BOUND = 0.6, -0.6, 2.0
@@ -140,3 +143,12 @@ def test_the_known_ground_and_an_object_inside_the_sphere_cost_nothing():
     contain, _ = contain_loss(field, rays, hits, on_ball, BOUND, generator())
     bound, wrong = bound_loss(field, 500, BOUND, GROUND, generator(), torch.device("cpu"))
     assert float(contain.detach()) < 1e-6 and float(bound.detach()) == 0 and not len(wrong)
+
+
+def test_the_learning_rate_warms_up_and_falls_to_its_last_value():
+    config = TrainConfig()
+    assert learning_factor(0, config) == 1 / 5000
+    assert learning_factor(5000, config) == 1.0
+    assert math.isclose(learning_factor(150_000, config), 0.05)
+    middle = learning_factor(77_500, config)
+    assert math.isclose(middle, 0.525)
