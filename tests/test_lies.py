@@ -211,7 +211,8 @@ def test_a_solved_scene_of_two_lies_equals_its_file_and_knows_both_worlds(laid, 
     albedo = torch.full((48, 64, 3), 0.5)
     place = (first.camera, first.world_from_camera, 0.0, "mm")
     grid, gloss = grid_of(SHAPES, 2.5), Gloss(torch.full((1, LOBES, 3), 0.25), torch.ones(48, 64, 1))
-    there = FurtherView("turned_1", albedo, scene.camera, scene.world_from_camera, scene.lights, gloss, motion)
+    other = (scene.camera, scene.world_from_camera, scene.lights, torch.ones(48, 64, 1), motion)
+    there = FurtherView("turned_1", albedo, *other)
     more = {"gloss": gloss, "evidence": torch.full_like(grid.values, 3.0), "light_share": 0.03}
     fields = SolvedScene(grid, albedo, *place, further=(there,), **more)
     save_fields(fields, tmp_path / "fields.safetensors")
