@@ -1,13 +1,13 @@
 """The shadows that a ball on a plane casts, drawn by their equations."""
 
 import numpy as np
+from flashlight_photos import looking_at
 
 from calibration.camera import Camera
 from calibration.ground.ground_field import GroundField
 from calibration.ground.ground_shadows import GroundShadows
 from calibration.lights.ground_cells import ground_points
 from calibration.outlines.outline_maps import outline_maps
-from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 
 WIDTH, HEIGHT, RADIUS = 252, 189, 30.0
@@ -17,10 +17,7 @@ EYE = np.array([0.0, -420.0, 380.0])
 
 def ball_camera(eye: np.ndarray = EYE) -> PosedCamera:
     """Return a camera that looks at the ball's middle."""
-    forward = (MIDDLE - eye) / np.linalg.norm(MIDDLE - eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    pose = Pose(np.stack([right, np.cross(forward, right), forward], 1), eye)
+    pose = looking_at(eye, MIDDLE)
     return PosedCamera(Camera(WIDTH, HEIGHT, 260.0, 260.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2), pose, 0.0)
 
 

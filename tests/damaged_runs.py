@@ -20,7 +20,8 @@ from fuzz_images import DAMAGES
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
-from strange_runs import STRANGE, by_change
+from strange_runs import DOCUMENTS, MARKUP, STRANGE, by_change
+from test_untrusted_files import Payload, png, tiff
 
 from calibration.calibrated_views import CalibratedView, CalibratedViews, save_views
 from calibration.calibration import Calibration, load_calibration, save_calibration
@@ -34,13 +35,11 @@ from reconstruct.mesh.mesh import extract_mesh, save_mesh
 from reconstruct.solve.checkpoint import write_checkpoint
 from viewer.stage.pack_file import write_stage
 
-MARKUP = "<script>alert('shadowgraph')</script><img src=x onerror=alert(1)>&\"'"  # text that must stay text
-JSON = ("calibration.json", "report.json", "manifest.json", "check.json", "config.json", "memory.json", "stage.json")
 TENSORS = ("fields.safetensors", "detail.safetensors", "checkpoint.safetensors")
 MAPS = ("depth.npy", "normal.npy")
 MESHES = ("mesh.ply", "preview.ply", "hull.ply")
 PICTURES = ("mask.png", "thumbs/*.jpg")
-FILES = (*JSON, *TENSORS, *MAPS, *MESHES, *PICTURES, "log.jsonl", "lock", "stage.zip")
+FILES = (*DOCUMENTS, *TENSORS, *MAPS, *MESHES, *PICTURES, "log.jsonl", "lock", "stage.zip")
 VALUES = (None, True, -1, 0, 1, 1e308, -1e308, 1e-308, 1e13, float("nan"), float("inf"), 2**70, [], {}, [[1]], [0] * 4)
 VALUES += ("", "x" * 300, "x" * 100_000, "../../etc/passwd", "/etc/passwd", "a\0b", "a\nb\x1b[2J", MARKUP)
 NUMBERS = (float("nan"), float("inf"), -float("inf"), 1e30, -1e30, 0.0, 1e-30, 6e4)
@@ -167,7 +166,7 @@ def by_bytes(draw: random.Random, run: Path) -> str:
 
 def by_value(draw: random.Random, run: Path) -> str:
     """One value of a JSON file exchanged, removed, or repeated."""
-    path = _chosen(draw, run, JSON)
+    path = _chosen(draw, run, DOCUMENTS)
     document, said = exchanged(draw, json.loads(path.read_text()))
     _write(path, document)
     return f"{path.name}: {said}"
@@ -194,29 +193,6 @@ def exchanged(draw: random.Random, document: Any) -> tuple[Any, str]:
         value = draw.choice(VALUES)
         here[key] = value
         return document, f"{way} = {value!r:.30}"
-
-
-def by_markup(draw: random.Random, run: Path) -> str:
-    """Every text of a JSON file, or of the log, becomes markup."""
-    if draw.random() < 0.3:
-        lines = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
-        texts = [{"message": MARKUP, "numbers": {f"loss_{MARKUP}": 1.0}}, {"stage": MARKUP}]
-        lines += [lines[-1] | draw.choice(texts)]
-        (run / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-        return "log.jsonl: markup"
-    path = _chosen(draw, run, JSON)
-    kept = {"mm", "scene", "point", "directional", "pinhole", "lit"}
-
-    def marked(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: marked(entry) for key, entry in value.items()}
-        if isinstance(value, list):
-            return [marked(entry) for entry in value]
-        is_changed = isinstance(value, str) and value not in kept and draw.random() < 0.5
-        return MARKUP.replace("/", "") if is_changed else value
-
-    _write(path, marked(json.loads(path.read_text())))
-    return f"{path.name}: markup"
 
 
 def by_numbers(draw: random.Random, run: Path) -> str:
@@ -299,16 +275,6 @@ def by_mesh(draw: random.Random, run: Path) -> str:
     return f"{path.name}: {way}"
 
 
-class Payload:
-    """Unpickling it makes a folder, which nobody else does."""
-
-    def __init__(self, path: Path):
-        self.path = path
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.path),)
-
-
 def by_map(draw: random.Random, run: Path) -> str:
     """A pickle in the place of numbers, another shape or type, numbers that are none."""
     path = run / draw.choice(MAPS)
@@ -354,15 +320,11 @@ def by_kind(draw: random.Random, run: Path) -> str:
 
 @cache
 def _large_png(edge: int, size: int) -> bytes:
-    from test_untrusted_files import png
-
     return png(edge, edge, bytes(size))
 
 
 def by_picture(draw: random.Random, run: Path) -> str:
     """A picture of another format, of 30,000 x 30,000 pixels, or a folder of them that leads elsewhere."""
-    from test_untrusted_files import png, tiff
-
     path = _chosen(draw, run, PICTURES)
     way = draw.choice(["bomb", "tiff", "svg", "other size", "link"])
     if way == "bomb":
@@ -397,7 +359,7 @@ def by_log(draw: random.Random, run: Path) -> str:
 
 
 WAYS: tuple[Callable[[random.Random, Path], str], ...] = (
-    *(by_bytes, by_bytes, by_value, by_value, by_value, by_markup, by_numbers, by_numbers, by_shape, by_header),
+    *(by_bytes, by_bytes, by_value, by_value, by_value, by_numbers, by_numbers, by_shape, by_header),
     *(by_header, by_mesh, by_map, by_kind, by_kind, by_picture, by_log),
     *STRANGE,
 )

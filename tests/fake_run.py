@@ -9,14 +9,13 @@ import torch
 import trimesh
 from PIL import Image
 from skimage.measure import marching_cubes
-from synthetic import HEAP, Look, Truth, render
+from synthetic import HEAP, Look, Truth, grid_of, render
 
 from calibration.calibration import Calibration, save_calibration
 from capture.photos.photo import encode_srgb
 from reconstruct.fields import SolvedScene, save_fields
-from reconstruct.sdf.grid import SdfGrid
 
-LOWER, SPACING, NODES = np.array([-70.0, -60.0, -6.0]), 2.0, (72, 64, 44)
+SPACING = 2.0  # mm
 
 
 def make_truth(width: int = 160, n_lights: int = 12) -> Truth:
@@ -38,20 +37,16 @@ def calibration_of(truth: Truth) -> Calibration:
 
 
 def fields_of(truth: Truth) -> SolvedScene:
-    axes = [LOWER[i] + SPACING * np.arange(NODES[i]) for i in range(3)]
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    values = torch.from_numpy(truth.sdf(nodes).reshape(NODES)).float()
-    grid = SdfGrid(values, torch.from_numpy(LOWER).float(), SPACING)
     albedo = torch.from_numpy(truth.albedo).float()
     pose = truth.calibration.world_from_camera
-    return SolvedScene(grid, albedo, truth.calibration.camera, pose, 0.0, "mm")
+    return SolvedScene(grid_of(truth.shapes, SPACING), albedo, truth.calibration.camera, pose, 0.0, "mm")
 
 
 def mesh_of(fields: SolvedScene, inflate: float = 0.0) -> trimesh.Trimesh:
     values = fields.grid.values.numpy() - inflate
     vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(SPACING,) * 3)
     colours = np.tile(np.array([[200, 160, 120, 255]], np.uint8), (len(vertices), 1))
-    return trimesh.Trimesh(vertices + LOWER, faces, vertex_colors=colours, process=False)
+    return trimesh.Trimesh(vertices + fields.grid.origin.numpy(), faces, vertex_colors=colours, process=False)
 
 
 def log_line(run_dir: Path, t: float, stage: str, done: float = 0, total: float = 0, text: str = "", **numbers) -> None:

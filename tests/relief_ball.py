@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from synthetic import BALL, Look, render
+from synthetic import BALL, Look, grid_of, render
 
 from calibration.calibration import Calibration
 from calibration.light import irradiance
@@ -67,14 +67,9 @@ def bent(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 def _solved(calibration: Calibration) -> SolvedScene:
     """The ball without relief, on a coarse grid, of one colour."""
-    lower = np.array([-56.0, -56.0, -8.0])
-    axes = [lower[i] + SPACING * np.arange(n) for i, n in enumerate((29, 29, 25))]
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    values = np.linalg.norm(nodes - np.array(BALL.centre), axis=-1) - BALL.radius
-    grid = SdfGrid(torch.from_numpy(values).float(), torch.from_numpy(lower).float(), SPACING)
     camera = calibration.camera.resized(WORKING, WORKING * 3 // 4)
     albedo = torch.from_numpy(np.tile((LIGHT + DARK) / 2, (camera.height, camera.width, 1))).float()
-    return SolvedScene(grid, albedo, camera, calibration.world_from_camera, 0.0, "mm")
+    return SolvedScene(grid_of((BALL,), SPACING), albedo, camera, calibration.world_from_camera, 0.0, "mm")
 
 
 def angles(found: np.ndarray, true: np.ndarray) -> np.ndarray:

@@ -15,38 +15,13 @@ from contextlib import suppress
 from pathlib import Path
 
 DEEP, LONG = 100_000, 100_000  # brackets within each other; digits of a number, files of a folder by a tenth
-DOCUMENTS = (
-    "calibration.json",
-    "report.json",
-    "manifest.json",
-    "check.json",
-    "config.json",
-    "stage.json",
-    "memory.json",
-)
-TENSORS = ("fields.safetensors", "detail.safetensors", "checkpoint.safetensors")
-NAMES = (
-    *(
-        "../photos/IMG_1.jpg",
-        "..\\IMG_1.jpg",
-        "C:\\IMG_1.jpg",
-        "/IMG_1.jpg",
-        "CON",
-        "",
-        ".",
-        "a/../b.jpg",
-        "IMG_1.jpg\0.png",
-    ),
-    *(
-        "\u202egpj.1_GMI",
-        "IMG_1.jpg\u200b",
-        "\ud800.jpg",
-        unicodedata.normalize("NFD", "Bü.jpg"),
-        "img_1.JPG",
-        "x" * 5000,
-    ),
-    *("IMG_1.jpg\r\nSet-Cookie: a", "\x1b]0;title\x07", "%2e%2e%2fsecret", "~/.ssh/id", "file:///etc/passwd", "*"),
-)
+DOCUMENTS = ("calibration.json", "report.json", "manifest.json", "check.json", "config.json")
+DOCUMENTS += ("memory.json", "stage.json")
+MARKUP = "<script>alert('shadowgraph')</script><img src=x onerror=alert(1)>&\"'"  # which must stay text
+NAMES = ("../photos/IMG_1.jpg", "..\\IMG_1.jpg", "C:\\IMG_1.jpg", "/IMG_1.jpg", "CON", "", ".", "a/../b.jpg")
+NAMES += ("IMG_1.jpg\0.png", "\u202egpj.1_GMI", "IMG_1.jpg\u200b", "\ud800.jpg", unicodedata.normalize("NFD", "Bü.jpg"))
+NAMES += ("img_1.JPG", "IMG_1.jpg\r\nSet-Cookie: a", "\x1b]0;title\x07", "%2e%2e%2fsecret", "~/.ssh/id", "*")
+NAMES += ("file:///etc/passwd", "x" * 5000, MARKUP)
 CHANGING_S = 1.5  # for how long a file goes on changing
 
 

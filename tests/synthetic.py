@@ -3,10 +3,12 @@
 Millimetres, ground z = 0. One ray per pixel centre, exact hard shadows, Lambertian surfaces, no light between them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 
 from calibration.calibration import Calibration
@@ -15,6 +17,7 @@ from calibration.light import Light, beam_gain
 from calibration.pose import Pose
 from capture.photos.photo import PhotoStack
 from reconstruct.scene import Scene, build_scene
+from reconstruct.sdf.grid import SdfGrid
 
 SKIN = 1e-6  # mm along the normal: a shadow ray starts outside the surface it leaves
 
@@ -164,6 +167,16 @@ def render(
     shadow = truth.visibility if look.with_shadow else None
     mask = truth.mask.astype(float) if look.with_mask else None
     return build_scene(stack, calibration, max(grid), shadow=shadow, mask=mask), truth
+
+
+def grid_of(shapes: Sequence[Shape], spacing: float) -> SdfGrid:
+    """The exact distances from shapes, in a box that goes four nodes beyond them."""
+    low = np.min([np.subtract(s.centre, s.radius) if isinstance(s, Sphere) else s.lower for s in shapes], axis=0)
+    high = np.max([np.add(s.centre, s.radius) if isinstance(s, Sphere) else s.upper for s in shapes], axis=0)
+    axes = [np.arange(a, b, spacing) for a, b in zip(low - 4 * spacing, high + 4 * spacing, strict=True)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    values = np.min([_distance(shape, nodes) for shape in shapes], axis=0)
+    return SdfGrid(torch.from_numpy(values).float(), torch.from_numpy(nodes[0, 0, 0]).float(), spacing)
 
 
 def default_camera(width: int, height: int) -> tuple[Camera, Pose]:

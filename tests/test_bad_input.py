@@ -77,13 +77,3 @@ def test_a_graphics_card_that_torch_does_not_see(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     sentence = refusal(capsys, tmp_path, SPOT, "--device", "cuda")
     assert "cuda" in sentence and "cpu" in sentence
-
-
-def test_a_disk_without_room_ends_in_one_sentence(capsys, tmp_path, monkeypatch):
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device", str(tmp_path / "mesh.stl"))
-
-    monkeypatch.setattr("shadowgraph.command.execute", full)
-    assert shadowgraph.main(["export", str(tmp_path), str(tmp_path / "mesh.stl")]) == 2
-    error = capsys.readouterr().err
-    assert "No space left" in error and "mesh.stl" in error and "Traceback" not in error

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from calibration.flashlight import model
 from calibration.flashlight.beam_profile import (
     RING_SPAN,
     RING_TERMS,
@@ -13,7 +12,7 @@ from calibration.flashlight.beam_profile import (
 )
 from calibration.flashlight.descent import refine
 from calibration.flashlight.fit import ALIKE_POWER, FAR, NEAR, START_BEAM
-from calibration.flashlight.model import Evidence, Flashlights, Priors
+from calibration.flashlight.model import Evidence, Flashlights
 from calibration.flashlight.pictured import bent, places_held
 from calibration.lights.ground_cells import GroundCells
 
@@ -58,27 +57,6 @@ def test_aims_and_powers_of_beams_with_rings_are_found():
     angle = np.arange(0.0, 45.0)[None]
     profile = log_gain(np.cos(np.radians(angle)), found.beam) - np.log(_led(angle))
     assert np.ptp(profile) < 0.15  # log units, of a profile that falls by 1.9 and has a ring
-
-
-def test_what_is_expected_of_powers_beam_and_ambient_light_costs_one_at_one_sigma_and_has_these_derivatives():
-    places, axes, evidence = _table()
-    n, priors = len(places), Priors()
-    ground = places - axes * places[:, 2:] / axes[:, 2:]
-    power = np.r_[0.01, 1.0, np.linspace(-0.3, 0.3, n - 2)]
-    wall = np.array([1.0, 6.0, 0.3])
-    state = Flashlights(places, ground, power, np.array([1.0, 0.5, 0.2, -0.1]), 0.2, evidence.cells.centre, wall)
-    value, slope = model._prior_terms(state, evidence, priors)
-    of_power = value[2 * n : 3 * n]
-    np.testing.assert_allclose(of_power[0], 1, rtol=0.01)
-    np.testing.assert_allclose(of_power**2, (power / 0.01) ** 2 / (1 + (power / 0.1) ** 2))  # Geman and McClure's
-    assert of_power[1] < 10  # another exposure: no more than ten sigmas
-    np.testing.assert_allclose(value[3 * n : 3 * n + 5], [0.2, 0.1, 0.04, -0.02, 1.0], atol=1e-12)
-    full = slope.shape[1]
-    for column in [*range(6, 7 * n, 7), *range(7 * n, full)]:
-        step = np.zeros(full)
-        step[column] = 1e-6
-        ends = (model._prior_terms(state.moved(sign * step, 0.0), evidence, priors)[0] for sign in (1, -1))
-        np.testing.assert_allclose((next(ends) - next(ends)) / 2e-6, slope[:, column], rtol=1e-4, atol=1e-6)
 
 
 def test_derivatives_of_the_profile_are_those_of_differences():

@@ -1,21 +1,12 @@
 """A grid kept on the blocks near its surface is the grid kept whole: same values, same rays, same steps."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-import torch
-from synthetic import BALL, Look, render
 
-from reconstruct.config import FitConfig
-from reconstruct.labels.labels import assemble_labels
-from reconstruct.labels.supervision import supervise
 from reconstruct.sdf import kernels
 from reconstruct.sdf.blocks import Blocks, overlapping, pack
-from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.level_set import BAND, LevelSet, resampled
+from reconstruct.sdf.level_set import BAND, LevelSet
 from reconstruct.sdf.rays import first_surfaces
-from reconstruct.solve.operators import RayPasses
 
 SHAPE = (101, 67, 86)  # no side is a whole number of blocks
 CENTRE = np.array([50.0, 33.0, 40.0])
@@ -63,25 +54,3 @@ def test_rays_that_leap_find_what_rays_through_every_node_find(sharpness):
         kernels.transmittances(phi, starts, lights, sharpness, out[1], 0, n)
     assert 0.2 < (expected[0] < kernels.FAR).mean() < 0.9 and 0.2 < expected[1].mean() < 0.9
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
-
-
-def test_a_solve_on_blocks_is_the_solve_on_the_whole_grid():
-    scene, _ = render((BALL,), Look(width=80, height=60, n_lights=8, with_shadow=True, with_mask=True))
-    scene = replace(scene, rgb=None)
-    labels = assemble_labels(scene, None, None)
-    start = SdfGrid(torch.ones(30, 30, 30), torch.tensor([-60.0, -60.0, -20.0]), 4.0)
-    grid = np.stack(np.meshgrid(*[np.arange(30.0) * 4] * 3, indexing="ij"), -1) + start.origin.numpy()
-    away = np.linalg.norm(grid - np.array([3.0, 0.0, 38.0]), axis=-1) - 37
-    on_blocks = resampled(replace(start, values=torch.from_numpy(away).float()), 90)
-    on_all = resampled(replace(start, values=torch.from_numpy(away).float()), 90)
-    on_all._keep(whole(on_all.phi))
-    assert len(on_blocks.field.pool) < 0.7 * len(on_all.field.pool)
-    for surface in (on_blocks, on_all):
-        shoot = RayPasses(surface, scene, supervise(scene, labels), FitConfig(rays=20_000))
-        for i in range(8):
-            shoot.look(surface.grid(), scene, i, 12.0, 0.5)
-            shoot(i, 12.0)
-            surface.step(2, 0.3, 2.5e-4, 0.0, 4, 0.1)
-    moved = np.abs(on_all.phi - resampled(replace(start, values=torch.from_numpy(away).float()), 90).phi)
-    assert moved.max() > 0.5
-    np.testing.assert_allclose(on_blocks.phi, on_all.phi, atol=1e-5)

@@ -21,7 +21,7 @@ from reconstruct.render.radiosity import find_patches
 from reconstruct.render.relight import environment, relight
 from reconstruct.sdf.grid import SdfGrid
 from tests.fake_run import fields_of
-from tests.synthetic import BALL, HEAP, Look, render
+from tests.synthetic import BALL, HEAP, Look, grid_of, render
 from tests.test_relight import CAMERA, CENTRE, POSE, RADIUS, sphere_grid
 
 HEIGHT = float(CENTRE[2])
@@ -105,9 +105,7 @@ def test_the_bottom_of_the_world_has_no_patches():
 def test_how_white_surfaces_are_shows_in_what_they_send_each_other(true, room, ground_known):
     """Also where nothing tells the room's light: it is not taken for light between surfaces, nor the reverse."""
     photos, truth = render((BALL,), Look(n_lights=12, texture=0.3, noise=0.002))
-    spacing, origin = 2.5, torch.tensor([-50.0, -50.0, -5.0])
-    nodes = torch.stack(torch.meshgrid(*[torch.arange(n) for n in (41, 41, 38)], indexing="ij"), -1)
-    grid = SdfGrid((origin + spacing * nodes - torch.tensor(BALL.centre)).norm(dim=-1) - BALL.radius, origin, spacing)
+    grid = grid_of((BALL,), 2.5)
     albedo, at, facing = (torch.from_numpy(a).float() for a in (truth.albedo, truth.points, truth.normals))
     camera, pose = truth.calibration.camera, truth.calibration.world_from_camera
     fields = SolvedScene(grid, albedo, camera, pose, 0.0, "mm")

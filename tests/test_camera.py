@@ -26,10 +26,6 @@ def views(camera, n, rng, noise_px=0.1):
     return [corners_of(BOARD, camera, slanted(rng, tilt), noise_px, rng) for tilt in tilts]
 
 
-def test_the_centre_of_the_first_pixel_is_zero():
-    assert np.array_equal(Camera(4, 2, 1.0, 1.0, 1.5, 0.5).pixel_grid()[0, 0], [0, 0])
-
-
 def test_resized_agrees_with_what_opencv_does_to_a_ramp():
     ramp = np.tile(np.arange(64, dtype=np.float32), (48, 1))
     small = cv2.resize(ramp, (32, 24), interpolation=cv2.INTER_AREA)

@@ -1,12 +1,12 @@
-"""dark/ beside a list of lights: subtracted as in captures, or said why not."""
+"""Pictures beside photos: dark/ is subtracted, mask.png is the object, or it is said why not."""
 
 import numpy as np
 import pytest
-from dataset_folders import loaded, towards_lights, write_diligent, write_photo, write_rti
+from dataset_folders import from_above, loaded, towards_lights, write_diligent, write_grey, write_photo, write_rti
 from synthetic import BALL, Look, render
-from test_importers import from_above
 
 from calibration.scenes.importers import import_folder
+from capture.errors import CaptureError
 from reconstruct.source.photos import read_photos
 from reconstruct.source.source import RunOptions, open_source
 
@@ -76,3 +76,26 @@ def test_those_that_cannot_be_are_said(tmp_path, picture, words):
     known = loaded(tmp_path)
     said = known.calibration.residuals["warnings"]
     assert known.dark_paths == () and any("dark is not used: " in text and words in text for text in said)
+
+
+@pytest.mark.parametrize(
+    ("size", "split", "words"),
+    [((48, 36), 24, None), ((40, 36), 20, r"mask\.png is 40 x 36"), ((48, 36), 0, "one colour")],
+)
+def test_a_mask_beside_the_settings_is_the_object(tmp_path, size, split, words):
+    pattern = np.random.default_rng(0).uniform(0.1, 0.5, (36, 48, 3))
+    write_photo(tmp_path / "board" / "IMG_0.png", pattern[::-1])
+    for i in range(4):
+        write_photo(tmp_path / "photos" / f"IMG_{i}.png", pattern * (1 + 0.2 * i))
+    mask = np.ones(size[::-1])
+    mask[:, :split] = 0
+    write_grey(tmp_path / "mask.png", mask)
+    source = open_source(tmp_path, RunOptions())
+    assert tmp_path / "mask.png" in source.files(RunOptions())
+    assert read_photos(source, RunOptions(mask="none"))[0].mask is None
+    if words is None:
+        found = read_photos(source, RunOptions())[0].mask
+        assert found is not None and np.array_equal(found, mask)
+    else:
+        with pytest.raises(CaptureError, match=words):
+            read_photos(source, RunOptions())

@@ -3,8 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-import torch
-from synthetic import BALL, Look, render
+from synthetic import BALL, Look, grid_of, render
 
 from reconstruct.labels.held_out import SHARE, draw_blocks, hold_out
 from reconstruct.labels.labels import assemble_labels
@@ -14,18 +13,14 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.early_stopping import COOL_DOWN, REST, EarlyStopping
 
 
-def ball(scene, truth, grow: float = 0.0) -> SdfGrid:
-    """The exact SDF of the rendered shapes grown by so many mm, 3 mm nodes."""
-    axes = [torch.arange(n) * 3.0 + o for n, o in ((34, -50.0), (34, -50.0), (36, -9.0))]
-    points = torch.cartesian_prod(*axes)
-    values = torch.from_numpy(truth.sdf(points.double().numpy())).float().reshape(34, 34, 36) - grow
-    return SdfGrid(values, torch.tensor([-50.0, -50.0, -9.0]), 3.0)
+def ball(grow: float = 0.0) -> SdfGrid:
+    """The ball grown by so many mm."""
+    return grid_of((replace(BALL, radius=BALL.radius + grow),), 3.0)
 
 
 def shadows():
-    scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=12))
-    scene = replace(scene, rgb=None)
-    return scene, truth, supervise(scene, assemble_labels(scene, None, None))
+    scene = replace(render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=12))[0], rgb=None)
+    return scene, supervise(scene, assemble_labels(scene, None, None))
 
 
 def drawn_from(scene, rays):
@@ -33,7 +28,7 @@ def drawn_from(scene, rays):
 
 
 def test_held_out_rays_are_a_small_share_in_blocks_and_never_train():
-    scene, _, rays = shadows()
+    scene, rays = shadows()
     trained, held_out = hold_out(rays, drawn_from(scene, rays))
     out = (rays.confidence > 0) & (trained.confidence == 0)
     assert 0.5 * SHARE < out.mean() < 1.6 * SHARE
@@ -44,9 +39,9 @@ def test_held_out_rays_are_a_small_share_in_blocks_and_never_train():
 
 
 def test_the_held_out_error_is_least_for_the_true_surface():
-    scene, truth, rays = shadows()
+    scene, rays = shadows()
     _, held_out = hold_out(rays, drawn_from(scene, rays))
-    errors = [held_out.error(ball(scene, truth, grow), scene) for grow in (-4.0, 0.0, 4.0)]
+    errors = [held_out.error(ball(grow), scene) for grow in (-4.0, 0.0, 4.0)]
     assert errors[1] < 0.5 * min(errors[0], errors[2])
 
 
@@ -59,8 +54,7 @@ def test_a_level_that_gains_no_more_cools_down_and_ends():
 
 
 def test_a_surface_that_gets_much_worse_is_taken_back():
-    scene, truth, _ = shadows()
-    good, bad = ball(scene, truth), ball(scene, truth, 4.0)
+    good, bad = ball(), ball(4.0)
     stopping = EarlyStopping().after(0.02, good).after(0.03, bad)
     assert stopping.chosen(bad) is good
     assert EarlyStopping().after(0.02, good).after(0.021, bad).chosen(bad) is bad

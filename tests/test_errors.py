@@ -1,6 +1,5 @@
 """What an error says to do: options in the terminal, buttons on the page; and words that neither uses."""
 
-import ast
 import pickle
 import re
 from collections.abc import Iterator
@@ -59,39 +58,3 @@ def test_every_remedy_has_words_in_each_front_end(remedy):
 def test_an_error_without_a_way_that_the_page_has_says_what_was_found():
     assert in_page_words(CaptureError("Uneven.", Remedy.GROUND)) == "Uneven."
     assert in_page_words(CaptureError("Damaged. Copy it again.")) == "Damaged. Copy it again."
-
-
-WORKSHOP = re.compile(  # words of a workshop, which nobody says who photographs a vase
-    r"\b(to be told|as it looks|light's phone(?<!flashlight's phone)|phones away|fused|numba|kernels|residuals?|rms|"
-    r"held[ -]out|photos usable|largest gap|shading alone$|next level|ASSUMED|sigmas)\b"
-)
-OF_THE_PAPER = {"options.py", "trainer.py"}  # options for research, and what a trained field says
-
-
-def said_texts() -> Iterator[tuple[str, str]]:
-    """Sentences of four words or more in the program, beside its docstrings, and in the pages."""
-    for package in ("capture", "calibration", "reconstruct", "viewer", "shadowgraph"):
-        for path in sorted((ROOT / package).rglob("*.py")):
-            tree = ast.parse(path.read_text(encoding="utf-8"))
-            docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-            for node in ast.walk(tree):
-                is_text = isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs
-                if is_text and node.value.count(" ") >= 3 and path.name not in OF_THE_PAPER:
-                    yield path.name, node.value
-    for path in sorted((ROOT / "viewer").rglob("*.js")):
-        code = re.sub(r"//.*|/\*[\s\S]*?\*/", "", path.read_text(encoding="utf-8"))
-        for text in re.findall(r'"[^"\n]*"|`[^`]*`', code):
-            yield path.name, text
-
-
-def test_no_sentence_uses_a_word_of_the_workshop():
-    texts = list(said_texts())
-    assert len(texts) > 1000
-    assert [(name, text) for name, text in texts if WORKSHOP.search(text)] == []
-
-
-@pytest.mark.parametrize(
-    "text", ["photos to be told", "held-out rays are off", "light's phone", "by fused CPU kernels"]
-)
-def test_a_word_of_the_workshop_is_found(text):
-    assert WORKSHOP.search(text) and not WORKSHOP.search("the flashlight's phone")

@@ -9,9 +9,8 @@ import trimesh
 from synthetic import BALL, Look, render
 from test_solver import assert_ball, of_shadows
 
-from reconstruct.fields import load_fields, save_fields
 from reconstruct.mesh.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence, volume_sigma
-from reconstruct.mesh.mesh import extract_mesh, save_mesh
+from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.run.report_json import guessed, undersides
 from reconstruct.scene import light_share
 from reconstruct.solve import solver
@@ -100,20 +99,6 @@ def test_a_volume_is_as_uncertain_as_its_surface_all_in_or_all_out_and_less_wher
         told.append(volume_sigma(ball))
     assert told[:2] == pytest.approx([between] * 2, rel=0.02)
     assert 0.2 * between < told[2] < 0.6 * between  # what is guessed is off to both sides
-
-
-def test_evidence_is_stored_with_the_fields_and_the_mesh(solved, tmp_path):
-    fields = replace(solved[0], light_share=0.03)
-    save_fields(fields, tmp_path / "fields.safetensors")
-    back = load_fields(tmp_path / "fields.safetensors")
-    assert back.light_share == 0.03
-    mesh = extract_mesh(back)
-    save_mesh(mesh, tmp_path / "mesh.ply", tmp_path / "mesh.glb", "mm")
-    read = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
-    assert len(read.vertices) == len(mesh.vertices)
-    text = (tmp_path / "mesh.ply").read_bytes()[:1000]
-    assert b"property uchar evidence" in text and b"property float sigma" in text
-    assert vertex_evidence(replace(fields, evidence=None), np.zeros((1, 3))) is None
 
 
 def test_a_surface_that_is_mostly_guessed_is_warned_of():

@@ -19,9 +19,6 @@ from capture.errors import ReconstructionError
 from reconstruct.export import maps
 from reconstruct.export.export import ExportOptions, _imported, export
 from reconstruct.mesh.simplify import bounds_a_solid
-from reconstruct.render import relight, studio
-from reconstruct.render.g_buffer import seen_material
-from reconstruct.render.studio import studio_of, turntable
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.report.formats import FORMATS
 
@@ -167,28 +164,6 @@ def test_an_mp4_is_what_browsers_play(run, tmp_path):
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
         assert stream.average_rate == 30
     assert (tmp_path / "it.mp4").read_bytes().index(b"moov") < 100  # in front: it starts before it is there
-
-
-def test_a_turn_reads_the_material_once_and_casts_many_rays_only_at_soft_edges(run, monkeypatch):
-    counted = {"material": 0, "pixels": 0, "soft": 0}
-
-    def material(fields):
-        counted["material"] += 1
-        return seen_material(fields)
-
-    def surely_seen(view, lit, *others):
-        sure = known(view, lit, *others)
-        counted["pixels"] += len(sure)
-        counted["soft"] += int((~sure).sum())
-        return sure
-
-    known = relight._surely_seen
-    monkeypatch.setattr(studio, "seen_material", material)
-    monkeypatch.setattr(relight, "_surely_seen", surely_seen)
-    stored = StoredRun(run)
-    pictures = list(turntable(stored.fields, studio_of(np.asarray(stored.mesh.bounds)), 160, 4))
-    assert len(pictures) == 4 and counted["material"] == 1
-    assert counted["pixels"] > 4 * 5000 and counted["soft"] < 0.7 * counted["pixels"], counted
 
 
 # --- what is refused -------------------------------------------------------------------------------------------------

@@ -6,7 +6,6 @@ import torch
 import trimesh
 from jaxtyping import Float
 
-from reconstruct.mesh import facets
 from reconstruct.mesh.facets import flipped
 from reconstruct.mesh.mesh import MAX_NODES, ROUNDS, surface_mesh
 from reconstruct.sdf.grid import SdfGrid
@@ -41,21 +40,6 @@ def test_triangles_face_as_the_distances_say_and_no_vertex_leaves_the_surface():
     assert np.average(angle, weights=areas[0]) < 0.7 * np.average(angle_before, weights=areas[1])
     assert abs(radius - radius_before) < 0.01 * SPACING and spread < spread_before
     assert angle.max() < 90 and after.is_watertight
-
-
-def test_a_share_of_the_last_move_brings_bumps_closer_in_as_many_steps(monkeypatch):
-    axis = np.arange(-24.0, 25.0)
-    nodes = np.stack(np.meshgrid(axis, axis, axis + 28, indexing="ij"), -1) - [0.3, -0.4, 28.2]
-    bumps = 0.3 * np.sin(nodes / [1.2, 1.3, 1.1]).prod(-1)
-    values = torch.from_numpy(np.linalg.norm(nodes, axis=-1) - 20 + bumps).float()
-    grid, means = SdfGrid(values, torch.tensor([-24.0, -24.0, 4.0]), 1.0), []
-    for momentum in (0.0, facets.MOMENTUM):
-        monkeypatch.setattr(facets, "MOMENTUM", momentum)
-        mesh = surface_mesh(grid, 0.0, MAX_NODES, is_faced=True)
-        wanted, _ = facets.facing(grid, np.asarray(mesh.triangles))
-        cosine = (wanted * mesh.face_normals).sum(1).clip(-1, 1)
-        means.append(np.average(np.arccos(cosine), weights=mesh.area_faces))
-    assert means[1] < 0.98 * means[0]
 
 
 def test_a_vertex_moves_by_a_quarter_of_a_voxel_at_most_each_round():

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from reconstruct.run_folder.folder import Progress
-from reconstruct.run_folder.forecast import STAGE_NAMES, Forecast, left_text, plan_numbers
+from reconstruct.run_folder.forecast import STAGE_NAMES, Forecast, plan_numbers
 from shadowgraph.terminal import Display
 
 PLANNED = {
@@ -87,20 +87,6 @@ def test_the_bar_never_goes_back_and_the_time_left_never_jumps(times):
     off = 4.0 if is_sudden else 2.2
     assert end / 2 / off <= half[2] <= end / 2 * off
     assert shown[-1] < 0.1 * end + 3
-
-
-@pytest.mark.parametrize(
-    ("seconds", "said"),
-    [
-        (None, ""),
-        (0.0, "a few seconds left"),
-        (34.0, "about 30 s left"),
-        (100.0, "about 2 min left"),
-        (1000.0, "about 17 min left"),
-    ],
-)
-def test_the_time_left_is_said_as_a_person_says_it(seconds, said):
-    assert left_text(seconds) == said
 
 
 @pytest.mark.parametrize("is_terminal", [True, False])

@@ -7,10 +7,10 @@ import cv2
 import lit_table
 import numpy as np
 import pytest
+from flashlight_photos import looking_at
 
 from calibration.camera import Camera
 from calibration.light import Light
-from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.reframed import UNPLACED, Doubt, reframed, with_doubt
 from capture.checks.check_stack import check_and_register
@@ -27,11 +27,8 @@ N, SIZE = 8, (lit_table.WIDTH, lit_table.HEIGHT)
 CAMERA = Camera(*SIZE, 300.0, 300.0, 158.0, 121.0, (-0.05, 0.02, 0.0, 0.0, 0.0), {"fx": 1.0})
 
 
-def posed(eye: tuple[float, float, float], target: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PosedCamera:
-    forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return PosedCamera(CAMERA, Pose(np.stack([right, np.cross(forward, right), forward], -1), np.array(eye)), 0.0)
+def posed(eye: tuple[float, float, float]) -> PosedCamera:
+    return PosedCamera(CAMERA, looking_at(np.array(eye), np.zeros(3)), 0.0)
 
 
 def plane(camera: PosedCamera) -> np.ndarray:

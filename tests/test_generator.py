@@ -6,18 +6,16 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial import cKDTree
 
 from calibration.board.board import parse_board
 from calibration.board.corners import find_board
 from calibration.camera import Camera
 from calibration.pose import Pose
 from capture.decode.exif import read_header
-from capture.errors import CaptureError
 from capture.photos.photo import read_photo
 from capture.session.session import load_session
 from examples.generator.lens import lens_of
-from examples.generator.options import Around, Exposure, Flashlight, Further, Phone, Setup, Table, Thing
+from examples.generator.options import Exposure, Flashlight, Phone, Setup, Table, Thing
 from examples.generator.shapes import build
 
 BOARD = "checkerboard:5x4:36"
@@ -90,44 +88,6 @@ def test_lit_ground_has_the_brightness_of_the_formula(capture):
 
 
 @pytest.mark.slow
-def test_views_and_lies_see_one_object_whose_motion_is_known(tmp_path):
-    for name in ("mitsuba", "embreex"):
-        pytest.importorskip(name, reason=f"{name} is not installed: pip install 'shadowgraph[generator]'")
-    from examples.generator.capturing import make_capture
-
-    setup = Setup(
-        Thing(shape="boxes"),
-        Table(BOARD, table="plain"),
-        Phone(width=160),
-        Flashlight(photos=2, radius=0.0),
-        Exposure(ambient=0.0, indirect=False, noise=0.0, samples=4),
-        further=Further(board_photos=2),
-        around=Around(views=2, lies=1, lie_views=2),
-    )
-    out = tmp_path / "boxes"
-    make_capture(out, setup, lambda text: None)
-    places = ("view_1", "view_2", "turned_1/view_1", "turned_1/view_2")
-    assert all(len(list((out / name / "photos").iterdir())) == 2 for name in places)
-    assert len({path.name for path in out.glob("**/photos/*")}) == 8
-    mesh = trimesh.load(out / "gt" / "object.ply", process=False)
-    with np.load(out / "gt" / "seen.npz") as stored:
-        assert tuple(stored["names"]) == places and stored["seen"].shape == (len(mesh.faces), 4)
-        assert (stored["seen"].mean(0) > 0.2).all() and (stored["seen"].mean(0) < 0.6).all()
-    surface = cKDTree(trimesh.sample.sample_surface(mesh, 100_000, seed=0)[0])
-    pose = np.array(json.loads((out / "gt/turned_1/pose.json").read_text())["T_object_from_turned"])
-    for name, back in zip(places, (np.eye(4), np.eye(4), pose, pose), strict=True):
-        camera = json.loads((out / "gt" / name / "camera.json").read_text())["stored"]
-        with np.load(out / "gt" / name / "maps.npz") as maps:
-            depth, mask = maps["depth_mm"].astype(float), maps["mask"]
-        k = np.array(camera["K"])
-        lens = Camera(160, 120, k[0, 0], k[1, 1], k[0, 2], k[1, 2], tuple(camera["dist_k1_k2_p1_p2_k3"]))
-        seen = (lens.unproject(lens.pixel_grid()) * depth[..., None])[mask]
-        points = Pose.from_matrix(back @ np.linalg.inv(np.array(camera["T_cam_from_board"]))).apply(seen)
-        assert mask.sum() > 50
-        assert np.abs(surface.query(points)[0]).max() < 1.5, name  # mm, between samples
-
-
-@pytest.mark.slow
 def test_the_capture_reads_as_a_session_and_the_moved_photo_is_marked(capture):
     session = load_session(capture)
     assert len(session.board) == 9 and len(session.lit) == 5
@@ -135,16 +95,6 @@ def test_the_capture_reads_as_a_session_and_the_moved_photo_is_marked(capture):
     assert usable == [True, False, True, True, True]
     header = read_header(session.lit[0])
     assert header.exposure.iso == 250 and header.taken_s is not None
-
-
-@pytest.mark.slow
-def test_a_used_folder_and_a_missing_mesh_are_refused(capture, tmp_path):
-    from examples.generator.capturing import load_thing, make_capture
-
-    with pytest.raises(CaptureError, match="not empty"):
-        make_capture(capture, Setup(), lambda text: None)
-    with pytest.raises(CaptureError, match="not a file"):
-        load_thing(Thing(mesh=tmp_path / "none.ply"))
 
 
 @pytest.mark.parametrize("spec", ["paper:A4", "card"])

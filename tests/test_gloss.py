@@ -13,7 +13,7 @@ from torch import Tensor
 from calibration.light import Light, irradiance
 from reconstruct.appearance.brdf import Material, facing_reflectance, specular
 from reconstruct.appearance.lobe_fit import Indirect, Samples, fit_lobes, from_endless_ground
-from reconstruct.fields import SolvedScene, load_fields, save_fields
+from reconstruct.fields import SolvedScene
 from reconstruct.labels.ground_test import test_ground as check_ground
 from reconstruct.labels.highlights import (
     lit_pixels,
@@ -30,7 +30,7 @@ from reconstruct.render.relight import relight
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from tests.glossy import highlight, polished
-from tests.synthetic import BALL, Look, Sphere, Truth, render
+from tests.synthetic import BALL, Look, Sphere, Truth, grid_of, render
 
 LOOK = Look(n_lights=24, texture=0.3, noise=0.002)
 ROUGHNESS, F0 = 0.4, 0.08
@@ -42,13 +42,6 @@ def tensor(values: np.ndarray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values)).float()
 
 
-def ball_grid() -> SdfGrid:
-    origin = torch.tensor([-50.0, -50.0, -5.0])
-    nodes = torch.cartesian_prod(torch.arange(41), torch.arange(41), torch.arange(38)).reshape(41, 41, 38, 3)
-    centre = torch.tensor(BALL.centre)
-    return SdfGrid((origin + SPACING * nodes - centre).norm(dim=-1) - BALL.radius, origin, SPACING)
-
-
 def dark(scene: Scene) -> Indirect:
     """No light from the ground."""
     return from_endless_ground(torch.zeros(len(scene.lights)))
@@ -57,11 +50,11 @@ def dark(scene: Scene) -> Indirect:
 def solved(scene: Scene, truth: Truth) -> SolvedScene:
     """The true surface with the material read from the photos."""
     normals = tensor(truth.normals * truth.mask[..., None])
-    lit = lit_pixels(scene, ball_grid(), tensor(truth.points), normals)
+    lit = lit_pixels(scene, grid_of((BALL,), SPACING), tensor(truth.points), normals)
     albedo, gloss = surface_appearance(scene, tensor(truth.points), normals, lit, dark(scene))
     albedo = torch.where(torch.from_numpy(truth.mask)[..., None], albedo, tensor(truth.albedo))
     pose = truth.calibration.world_from_camera
-    return SolvedScene(ball_grid(), albedo, truth.calibration.camera, pose, 0.0, "mm", gloss=gloss)
+    return SolvedScene(grid_of((BALL,), SPACING), albedo, truth.calibration.camera, pose, 0.0, "mm", gloss=gloss)
 
 
 @pytest.fixture(scope="module")
@@ -154,15 +147,6 @@ def test_gloss_is_that_of_the_part_that_shines():
     assert scale[on_object & ~left].median() < 0.2 * scale[on_object & left].median()
 
 
-def test_gloss_survives_its_file_and_files_without_it_still_load(fields, tmp_path):
-    save_fields(fields, tmp_path / "glossy.safetensors")
-    save_fields(replace(fields, gloss=None), tmp_path / "matt.safetensors")
-    again = load_fields(tmp_path / "glossy.safetensors").gloss
-    assert again is not None and fields.gloss is not None
-    assert torch.allclose(again.coefficients(), fields.gloss.coefficients(), atol=1e-2, rtol=1e-2)
-    assert load_fields(tmp_path / "matt.safetensors").gloss is None
-
-
 def test_the_glb_says_how_rough_the_object_is(fields, tmp_path):
     mesh = extract_mesh(fields)
     save_mesh(mesh, tmp_path / "mesh.ply", tmp_path / "mesh.glb", "mm", mesh_material(fields, mesh))
@@ -203,16 +187,13 @@ def test_ground_without_a_lit_label_gets_its_albedo_where_the_surface_lets_light
     assert scene.rgb is not None
     once = {"lights": scene.lights, "power": scene.power, "rgb": scene.rgb}  # three photos under one light
     scene = replace(scene, **{name: value[:1].expand_as(value) for name, value in once.items()})
-    axis = np.arange(-56.0, 57.0, 2.0)
-    nodes = np.stack(np.meshgrid(axis, axis, axis + 48, indexing="ij"), -1)
-    values = torch.from_numpy(np.linalg.norm(nodes - np.array(BALL.centre), axis=-1) - BALL.radius).float()
-    grid = SdfGrid(values, torch.tensor([-56.0, -56.0, -8.0]), 2.0)
     points = torch.from_numpy(np.where(np.isfinite(truth.depth)[..., None], truth.points, np.nan)).float()
     normals = torch.from_numpy(np.where(truth.mask[..., None], truth.normals, 0.0)).float()
     ground = np.isfinite(truth.depth) & ~truth.mask
     true = torch.from_numpy(truth.albedo).float()
     missing = torch.from_numpy(ground)[..., None]
-    found = with_lit_ground(scene, check_ground(scene), grid, points, normals, torch.where(missing, 0.0, true)).numpy()
+    known = torch.where(missing, 0.0, true)
+    found = with_lit_ground(scene, check_ground(scene), grid_of((BALL,), 2.0), points, normals, known).numpy()
     shade = ground & (ndimage.maximum_filter(truth.visibility[0], 5) == 0)
     light = ground & (ndimage.minimum_filter(truth.visibility[0], 5) == 1)
     assert shade.sum() > 50 and not found[shade].any()

@@ -11,7 +11,6 @@ from test_solver import Listener
 from calibration.camera import Camera
 from calibration.pose import Pose
 from reconstruct.config import FitConfig, Level
-from reconstruct.initialization import height_kernels
 from reconstruct.initialization.choose_start import (
     JUDGES_BLOCK,
     JUDGES_SEED,
@@ -86,56 +85,6 @@ def waves(height_mm: float) -> np.ndarray:
     """Depth of hills on the ground 400 mm below the camera, which show no bare ground."""
     v, u = np.mgrid[:WIDTH, :WIDTH] / WIDTH * 2 * np.pi
     return EYE_MM - height_mm * (1 + np.sin(2 * u + 0.5) * np.cos(1.5 * v)) / 2
-
-
-def test_the_gradient_of_the_heights_is_that_of_the_error():
-    """Against central differences of the loss sum log-likelihood / s, in a field without ties."""
-    rng = np.random.default_rng(3)
-    depth = waves(60.0)
-    scene, labels = seen_from_above(depth, lights_around(2))
-    view = height_view(scene, labels)
-    heights = rng.normal(0, 1.0, view.shape).astype(np.float32)
-    solid = np.full(view.shape, -1e6, np.float32)
-    labels_np = (np.ascontiguousarray(view.visibility), np.ascontiguousarray(view.confidence))
-    sharpness = 1.5
-
-    def loss(field: np.ndarray) -> float:
-        tops = np.empty([-(-n // height_kernels.TILE) for n in view.shape], np.float32)
-        height_kernels.tile_tops(field, tops)
-        total = 0.0
-        for k, light in enumerate(view.lights):
-            for i in range(WIDTH):
-                for j in range(WIDTH):
-                    here = field[i + view.padding, j + view.padding]
-                    ray = height_kernels._ray(
-                        (field, solid, tops), tops.max(), i, j, here, light, view.frame(), sharpness
-                    )
-                    if ray[1] >= 0:
-                        scale = scale_of(view, light, i, j, here)
-                        y = labels_np[0][k, i, j]
-                        m = sharpness * ray[0]
-                        total += scale * (y * np.logaddexp(0, -m) + (1 - y) * np.logaddexp(0, m)) / sharpness
-        return total
-
-    tops = np.empty([-(-n // height_kernels.TILE) for n in view.shape], np.float32)
-    height_kernels.tile_tops(heights, tops)
-    gradient, unused = np.zeros(view.shape), np.zeros(view.shape)
-    height_kernels.height_pass(
-        (heights, solid, tops), labels_np, view.lights, view.frame(), (sharpness, 1e9), gradient, unused, 0, WIDTH
-    )
-    for i, j in ((view.padding + 20, view.padding + 20), (view.padding + 31, view.padding + 12)):
-        step = np.zeros_like(heights)
-        step[i, j] = 1e-2
-        numeric = (loss(heights + step) - loss(heights - step)) / 2e-2
-        assert gradient[i, j] == pytest.approx(numeric, rel=0.15, abs=0.03)
-
-
-def scale_of(view, light, i, j, here) -> float:
-    """Rise per pixel of a ray, as the kernel bounds it."""
-    x = view.focal * light[0] - (j - view.centre[0]) * light[2]
-    y = view.focal * light[1] - (i - view.centre[1]) * light[2]
-    rise = (light[3] * view.focal * view.reference - light[2] * (view.focal + here)) / np.hypot(x, y)
-    return float(np.clip(abs(rise), height_kernels.FLATTEST, height_kernels.STEEPEST))
 
 
 def test_hills_without_any_bare_ground_come_from_their_shadows():

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from flashlight_photos import looking_at
 from scipy.ndimage import label
 from synthetic import BALL, HEAP, Box, Look, Sphere, default_camera, render
 
 from calibration.camera import Camera
-from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.side_view import SideView
 from capture.errors import ReconstructionError
@@ -45,10 +45,7 @@ def test_the_hull_holds_the_ball_and_not_much_more(kind):
 def test_a_photo_from_the_side_carves_what_few_lights_leave_and_nothing_else():
     scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=4))
     eye, middle = np.array([420.0, 60.0, 200.0]), np.array(BALL.centre)
-    forward = (middle - eye) / np.linalg.norm(middle - eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0]) / np.hypot(*forward[:2])
-    pose = Pose(np.stack([right, np.cross(forward, right), forward], 1), eye)
-    side = PosedCamera(Camera(240, 180, 300.0, 300.0, 119.5, 89.5), pose, 0.0)
+    side = PosedCamera(Camera(240, 180, 300.0, 300.0, 119.5, 89.5), looking_at(eye, middle), 0.0)
     rays = side.rays(side.camera.pixel_grid())
     miss = np.linalg.norm(np.cross(middle - eye, rays), axis=-1) / np.linalg.norm(rays, axis=-1)
     mask = miss < BALL.radius

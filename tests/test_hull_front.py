@@ -61,17 +61,6 @@ def test_the_hull_is_made_anew_behind_the_front(seen):
     assert float(after.sdf(torch.tensor([[-40.0, 0.0, 60.0]]))) > 0
 
 
-def test_without_normals_the_hull_stays(seen):
-    scene, truth, _ = seen
-    grid = SdfGrid(torch.ones(4, 4, 4), torch.zeros(3), 1.0)
-    mask = torch.from_numpy(truth.mask).float()
-    none, nothing = torch.zeros(*mask.shape, 3), torch.zeros(len(scene.lights), *mask.shape)
-    labels = Labels(nothing, nothing, mask, mask, none, torch.zeros_like(mask), none)
-    points, told = torch.from_numpy(truth.points).float(), torch.from_numpy(truth.normals).float()
-    found = on_front(grid, grid, scene, (points, told), points, labels)
-    assert found is grid
-
-
 @pytest.mark.parametrize("spoilt", ["on_front", "follow_normals"])
 def test_under_few_lights_the_start_that_the_shadows_contradict_is_left(monkeypatch, spoilt):
     scene, _ = render((BALL,), Look(width=64, height=48, n_lights=5))

@@ -75,17 +75,10 @@ def test_a_path_that_leaves_the_folder_is_refused(tmp_path):
     ("file", "change", "message"),
     [
         ("transforms_train.json", lambda c: c.pop("camera_angle_x"), "camera_angle_x"),
-        ("transforms_train.json", lambda c: c.update(camera_angle_x="wide"), "camera_angle_x"),
-        ("transforms_train.json", lambda c: c.update(frames=[]), "frames"),
         (
             "transforms_train.json",
             lambda c: c["frames"][2].pop("transform_matrix_sun"),
             r"frames\[2\].*transform_matrix_sun",
-        ),
-        (
-            "transforms_train.json",
-            lambda c: c["frames"][1].update(transform_matrix=[[1, 2], 3]),
-            r"frames\[1\].*4 rows of 4 numbers",
         ),
         ("transforms_train.json", lambda c: c["frames"][3].update(file_path="train/none"), "frame 3.*does not exist"),
         ("transforms_train.json", lambda c: c.update(light_type="laser"), "light_type.*laser"),

@@ -14,13 +14,12 @@ from dataset_folders import (
     write_s3nerf,
 )
 from PIL import Image
-from scipy.io import savemat
 from synthetic import BALL, Look, render
 from test_known import write_scene
 
 import shadowgraph
 from calibration.scenes.importers import import_folder
-from capture.errors import CaptureError, UserError
+from capture.errors import CaptureError
 from reconstruct.check.verdict import read_and_check
 from reconstruct.source.calibrate_source import calibrate_source
 from reconstruct.source.photos import read_photos
@@ -147,20 +146,6 @@ def test_a_bad_picture_of_shadows_is_left_out_with_its_photo_and_light(tmp_path,
     assert [light.photo for light in known.calibration.lights] == [path.name for path in named]
     read = read_photos(source, options)[0].shadow
     assert read is not None and len(read) == PHOTOS - 1
-
-
-@pytest.mark.parametrize(("name", "is_named"), [("lights.csv", False), ("lights.lp", True), ("lights.mat", True)])
-def test_a_list_with_fewer_rows_than_photos_says_both_counts_and_the_remedy(tmp_path, truth, name, is_named):
-    scene = by_order(tmp_path / "scene", truth)
-    (scene / "lights.csv").unlink()
-    given = (tmp_path if is_named else scene) / name
-    rows = towards_lights(truth)[:6]
-    if given.suffix == ".mat":
-        savemat(given, {"L": rows})
-    else:
-        np.savetxt(given, rows, fmt="%.6f", delimiter="," if given.suffix == ".csv" else " ")
-    with pytest.raises(UserError, match=rf"{name} lists 6 lights for 8 photos.*Name the photos in the file"):
-        open_source(scene, RunOptions(lights=str(given)) if is_named else RunOptions())
 
 
 def test_an_import_names_what_it_left_out_and_a_command_says_it(tmp_path, truth, capsys):

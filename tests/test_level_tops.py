@@ -32,7 +32,7 @@ def iou(found, truth) -> float:
     return (mask & truth.mask).sum() / (mask | truth.mask).sum()
 
 
-@pytest.mark.parametrize("height", [3.5, 4.0, 5.0, 15.0, 30.0])
+@pytest.mark.parametrize("height", [3.5, 5.0, 30.0])
 def test_the_level_top_of_a_box_coloured_like_the_ground_is_object_under_near_lights(height):
     scene, truth = render((slab(height),), NOISY)
     found = ground_module.test_ground(scene)

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from synthetic import BALL, HEAP, Look, render
 
 from reconstruct.fields import SolvedScene
-from reconstruct.hull.shadow_hull import carved
 from reconstruct.initialization.light_contradictions import contradictions
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.run.report_json import misfit, pieces
@@ -72,15 +71,3 @@ def test_pieces_in_the_air_are_warned_of_and_objects_on_the_ground_are_not():
     apart = trimesh.util.concatenate([box, above])
     assert "2 pieces, 1 of them in the air: shadows that contradict" in pieces(apart, fields)[0]
     assert "in the air: 5 photos leave open" in pieces(apart, replace(fields, lights=torch.ones(5, 4)))[0]
-
-
-def test_maps_that_carved_the_hull_give_the_same_doubts():
-    scene, _ = render((BALL,), LOOK)
-    lights = scene.lights.clone()
-    lights[3, :3] = torch.tensor([-1.0, 1.0, 1.0]) * lights[3, :3]
-    scene = replace(scene, lights=lights)
-    labels = assemble_labels(scene, None, None)
-    anew, known = contradictions(scene, labels), contradictions(scene, labels, carved(scene, labels, 2, 32).maps)
-    np.testing.assert_array_equal(anew.unexplained, known.unexplained)
-    np.testing.assert_array_equal(anew.resolved, known.resolved)
-    assert anew.sentences()

@@ -161,15 +161,9 @@ def test_a_list_with_sigmas_is_weighed_against_what_the_photos_say(tmp_path):
         ("a.json", '{"lights": [{"photo": "IMG_0000.jpg", "position": [1, 2]}]}', r"lights\[0\].position is \[1, 2\]"),
         ("a.json", '{"lights": [{"photo": "IMG_0000.jpg", "position": [1, 2, 3]}]}', "no light for 3 of 4 photos"),
         ("a.json", '{"suns": []}', "of no known kind"),
-        (
-            "a.json",
-            '{"frames": [{"transform_matrix_sun": [[1, 0, 0, 0]], "transform_matrix": []}]}',
-            r"transform_matrix is .*needed: 4 rows of 4 numbers",
-        ),
         ("a.json", "{", "is not JSON"),
         ("a.npz", "no archive", "cannot be read"),
         ("a.dome", '{"positions3d": [[0, 0, 1]], "directions": []}', "'imageWidth'"),
-        ("a.dome", '{"directions": [[0, 0, 1]], "lightConfiguration": []}', "lightConfiguration is .*needed: a text"),
         ("params.json", json.dumps({"light_pos": [], "pose_c2w": np.eye(4).tolist()}), "one place for each photo"),
     ],
 )

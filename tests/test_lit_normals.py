@@ -1,16 +1,10 @@
 """Truth: normals of planes and balls under known lights, without and with cast shadows."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
-from reconstruct.config import FitConfig, Level
-from reconstruct.initialization.choose_start import HULL, HullStart
-from reconstruct.labels.observer import Observer
 from reconstruct.shading.normal_fit import normals_of_lit
-from tests.synthetic import BALL, Box, Look, render
 
 RAY = torch.tensor([0.0, 0.6, -0.8])
 
@@ -63,21 +57,3 @@ def test_few_lights_on_one_side_leave_the_normal_open():
     towards = lights(4, 40, 50)
     _, confidence = read(torch.tensor([[0.0, 0, 1]]), towards, torch.ones(4, 1), torch.ones(4, 1))
     assert confidence[0] < 0.1
-
-
-def shadow_start(shape, name: str = HULL) -> tuple[HullStart, tuple]:
-    """The start of a solve from exact shadow pictures with a mask, and its scene."""
-    scene, _ = render((shape,), Look(n_lights=24, with_shadow=True, with_mask=True))
-    scenes = (replace(scene, rgb=None),)
-    config = FitConfig(levels=(Level(40, 1, (0.5, 0.4), 1),))
-    return HullStart(scenes, (Observer(scenes[0]),), config, lambda _: None, name), scenes
-
-
-@pytest.mark.parametrize("shape", [BALL, Box((-50, -40, 0), (50, 40, 20))])
-def test_a_resumed_solve_reads_normals_exactly_if_the_first_one_did(shape):
-    first, scenes = shadow_start(shape)
-    surface = first.surface()
-    (labels,) = first.labels(surface, scenes)
-    (again,) = shadow_start(shape, first.name)[0].labels(surface, scenes)
-    assert torch.equal(labels.normals, again.normals)
-    assert torch.equal(labels.normal_confidence, again.normal_confidence)

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from reconstruct.torch_sdf import march
-from reconstruct.torch_sdf.march import RecordedBlock, State, Volume, marched
+from reconstruct.torch_sdf.march import RecordedBlock, State, Volume
 
 NODES, RAYS = 24, 700
 
@@ -38,9 +38,3 @@ def test_a_block_used_again_gives_what_its_operations_give_one_by_one(margin):
         for mine, theirs in zip(found, expected, strict=True):
             assert len(mine) >= len(theirs)
             assert torch.equal(mine, torch.cat([theirs, theirs[-1:].expand(len(mine) - len(theirs), -1)]))
-
-
-def test_the_cpu_records_nothing():
-    volume, rays, reach = setting(1.2, 0, RAYS)
-    marched(volume, rays, reach)
-    assert not march._blocks

@@ -2,7 +2,6 @@
 
 import json
 import resource
-import sys
 from dataclasses import asdict
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from capture.files.atomic import write_json
 from reconstruct.run import pipeline
 from reconstruct.run_folder import forecast
 from reconstruct.run_folder.folder import PLAN, RunFolder
-from reconstruct.run_folder.forecast import give_memory_back, memory_room, share_memory_among_threads
+from reconstruct.run_folder.forecast import memory_room
 from reconstruct.source.photos import MARGIN, OVERRIDE, plan_for, predicted_memory, read_plan
 from reconstruct.source.source import RunOptions, Source
 
@@ -101,12 +100,3 @@ def test_a_run_keeps_to_its_decision_and_writes_which_photos_it_left_out(tmp_pat
         assert all(light.used for light in load_calibration(run.file("calibration.json")).lights)
         plan = read_plan(run.file(PLAN))
         assert plan is None or OVERRIDE not in plan.sentence
-
-
-def test_what_the_allocator_is_told_leaves_what_is_held(monkeypatch):
-    held = [bytearray([n]) * 65536 for n in range(100)][::10]
-    for platform in ("linux", "win32"):
-        monkeypatch.setattr(sys, "platform", platform)
-        share_memory_among_threads()
-        give_memory_back()
-    assert all(set(one) == {10 * n} for n, one in enumerate(held))

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from flashlight_photos import looking_at
 from scipy.spatial.transform import Rotation
 
 from calibration.calibration import Calibration, save_calibration
@@ -20,12 +21,7 @@ from reconstruct.evaluate.surface_distance import hidden_from, nmze, register, s
 SIDE, FOCAL = 80, 150.0
 SAMPLES = 10_000  # on each surface: a tenth of the real measure, for speed
 EYE = np.array([0.0, -3.0, 2.5])
-
-
-def facing_origin() -> Pose:
-    forward = -EYE / np.linalg.norm(EYE)
-    right = np.array([1.0, 0, 0])
-    return Pose(np.stack([right, np.cross(forward, right), forward], 1), EYE)
+POSE = looking_at(EYE, np.zeros(3))
 
 
 def ball(radius: float = 0.5, centre=(0.0, 0.0, 0.2)) -> trimesh.Trimesh:
@@ -51,7 +47,7 @@ def scene(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("scene")
     truth = folder / "gt"
     truth.mkdir()
-    camera, pose, mesh = Camera(SIDE, SIDE, FOCAL, FOCAL, SIDE / 2 - 0.5, SIDE / 2 - 0.5), facing_origin(), ball()
+    camera, pose, mesh = Camera(SIDE, SIDE, FOCAL, FOCAL, SIDE / 2 - 0.5, SIDE / 2 - 0.5), POSE, ball()
     depth, normals, mask = maps_of(mesh, 0.0, camera, pose)
     np.save(truth / "depth.npy", depth.astype(np.float32))
     np.save(truth / "normal.npy", normals.astype(np.float32))
@@ -98,7 +94,7 @@ def test_a_depth_that_is_too_large_by_a_constant_scores_that_constant_until_it_i
 
 def test_a_mesh_without_its_back_loses_what_the_camera_cannot_see(scene, tmp_path):
     mesh = ball()
-    mesh.update_faces(~hidden_from(mesh, facing_origin().inverse().matrix(), mesh.triangles_center, mesh.face_normals))
+    mesh.update_faces(~hidden_from(mesh, POSE.inverse().matrix(), mesh.triangles_center, mesh.face_normals))
     numbers = evaluate(save_result(tmp_path, mesh), scene, SAMPLES)
     assert numbers["visible_recall"] > 0.97
     assert numbers["hidden_recall"] < 0.3
@@ -133,11 +129,8 @@ def write_capture(folder: Path, world_from_board: Pose) -> tuple[Path, Path]:
     truth = reference / "gt"
     truth.mkdir(parents=True)
     result.mkdir()
-    camera, board_from_camera = (
-        Camera(SIDE, SIDE, FOCAL, FOCAL, 40.0, 39.0, (0.05, -0.02, 0.0, 0.0, 0.0)),
-        facing_origin(),
-    )
-    board_from_camera = Pose(board_from_camera.rotation, 100 * EYE)
+    camera = Camera(SIDE, SIDE, FOCAL, FOCAL, 40.0, 39.0, (0.05, -0.02, 0.0, 0.0, 0.0))
+    board_from_camera = Pose(POSE.rotation, 100 * EYE)
     mesh = ball(50, (0, 0, 20))
     depth, normals, mask = maps_of(mesh, -0.2, camera, board_from_camera)
     np.savez(truth / "maps.npz", depth_mm=depth, normal=normals.astype(np.float16), mask=mask)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from synthetic import Box, Look, render
+from synthetic import Box, Look, grid_of, render
 
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.outline import outline_of
@@ -22,14 +22,6 @@ BLOCK = Box((-5, -5, 47), (17, 17, 84))
 TABLE = (TOP, *LEGS, BLOCK)  # a seat above legs and what lies on it: no height field
 
 
-def of(shapes, truth) -> SdfGrid:
-    """The exact surface of some shapes, 2 mm nodes."""
-    nodes = [np.arange(low, high, 2.0) for low, high in ((-60, 60), (-50, 50), (-6, 90))]
-    world = np.stack(np.meshgrid(*nodes, indexing="ij"), -1)
-    values = replace(truth, shapes=shapes).sdf(world.reshape(-1, 3)).reshape(world.shape[:3])
-    return SdfGrid(torch.from_numpy(values).float(), torch.tensor([-60.0, -50.0, -6.0]), 2.0)
-
-
 @pytest.fixture(scope="module")
 def table():
     scene, truth = render(TABLE, LOOK)
@@ -38,7 +30,7 @@ def table():
 
 def test_a_missing_part_is_surely_object_and_the_rest_is_not_decided_wrongly(table):
     scene, truth = table
-    found = outline_of(scene, of((TOP, *LEGS), truth), torch.ones_like(scene.shadow))
+    found = outline_of(scene, grid_of((TOP, *LEGS), 2.0), torch.ones_like(scene.shadow))
     sure, shown = found.confidence.numpy() > 0.5, found.mask.numpy() > 0.5
     block = truth.mask & ~render((TOP, *LEGS), LOOK)[1].mask  # it stands out beyond the top
     front = block & (truth.normals[..., 2] < 0.5)  # its top is lit by every light, as the ground behind it is
@@ -52,15 +44,15 @@ def test_a_surface_that_lacks_a_part_is_doubted_and_the_true_one_is_not(table):
     observer = Observer(scene)
     rays = supervise(scene, observer.ground_labels())
     rays = replace(rays, confidence=np.zeros_like(rays.confidence))  # as if all were held out
-    assert shadow_doubts((scene,), (observer,), (rays,), of(TABLE, truth)) == ()
-    (doubt,) = shadow_doubts((scene,), (observer,), (rays,), of((TOP, *LEGS), truth))
+    assert shadow_doubts((scene,), (observer,), (rays,), grid_of(TABLE, 2.0)) == ()
+    (doubt,) = shadow_doubts((scene,), (observer,), (rays,), grid_of((TOP, *LEGS), 2.0))
     assert "of the shadow that was set aside for a test" in doubt and "below 4 %" in doubt
 
 
 @pytest.mark.parametrize("shift", [1.5, -1.5])  # mm; a pixel is some 3 mm wide
 def test_the_labels_put_right_an_outline_that_is_off_by_half_a_pixel(table, shift):
     scene, truth = table
-    whole = of(TABLE, truth)
+    whole = grid_of(TABLE, 2.0)
     shifted = SdfGrid(whole.values + shift, whole.origin, whole.spacing)
     found = outline_of(scene, shifted, torch.ones_like(scene.shadow))
     shown = found.mask.numpy() > 0.5

@@ -9,7 +9,6 @@ from ball_shadows import EYE, RADIUS, ball_camera, drawn, hits_ball, photographe
 from calibration.flashlight import joint_search, outline_lights
 from calibration.flashlight.fit import ALIKE_POWER, FlashlightFit, does_not_follow, variance_about
 from calibration.flashlight.model import Evidence, Flashlights, free_tangent, log_irradiance
-from calibration.flashlight.outline_lights import outline_sigma
 from calibration.flashlight.pictured import bent
 from calibration.flashlight.wall import NO_WALL, Wall
 from calibration.lights.ground_cells import GroundCells
@@ -148,14 +147,6 @@ def test_fits_are_compared_by_the_cells_that_they_are_fitted_to(ball):
         cells = (evidence.weight > 0).sum() / joint_search.alike(evidence.weight)
         gap = np.diff(joint_search._posteriors(found, evidence))
         np.testing.assert_allclose(gap, 1.5 + cells * np.log(1.1), rtol=1e-9)
-
-
-def test_the_stated_error_covers_the_other_fits(ball):
-    _, lights, maps = ball
-    fit, _ = _with_one_lost(maps, lights, 3)
-    doubt = np.full(lights.shape, 40.0**2)
-    with_others, alone = outline_sigma(replace(fit, between=doubt)), outline_sigma(replace(fit, between=0.0))
-    np.testing.assert_allclose(with_others**2 - alone**2, doubt, rtol=1e-6)
 
 
 def test_the_variance_of_a_mixture_is_about_the_fit_that_is_chosen():

@@ -9,8 +9,8 @@ from ball_shadows import EYE, HEIGHT, MIDDLE, RADIUS, WIDTH, ball_camera, drawn,
 from flashlight_photos import looking_at
 
 from calibration.flashlight.outline_lights import OUTLINES_WRONG
-from calibration.ground.ground_field import GroundField, fit_ground_field
-from calibration.ground.ground_shadows import GroundShadows, find_shadows
+from calibration.ground.ground_field import GroundField
+from calibration.ground.ground_shadows import GroundShadows
 from calibration.ground.mirror_highlights import MirrorHighlights, find_highlights
 from calibration.lights.ground_cells import ground_points
 from calibration.outlines.carried_light import offset_by_outlines
@@ -260,27 +260,3 @@ def test_a_photo_from_the_side_and_a_height_fix_the_scale_that_shadows_leave_fre
         moved = _moved_together(lights, share / EYE[2])
         free = _cost(maps, moved) - _cost(maps, lights)
         assert _cost(held, moved) - _cost(held, lights) > free + 2.0
-
-
-def test_the_field_finds_shadows_that_a_hot_beam_and_a_tone_curve_hide(ball):
-    camera, lights, _ = ball
-    points, _ = ground_points(camera)
-    mask = hits_ball(np.broadcast_to(EYE, points.shape), points)
-    rng = np.random.default_rng(2)
-    albedo = 0.3 * np.exp(0.2 * rng.standard_normal(mask.shape))
-    photos = []
-    for light in lights:
-        away = np.linalg.norm(points - light, axis=-1)
-        aim = np.linalg.norm(points[..., :2] - rng.normal(0, 80, 2), axis=-1)
-        beam = np.exp(-((aim / 220) ** 2)) + 0.2
-        lit = ~hits_ball(points, light)
-        light_there = np.where(lit, 1.0, 0.1) * beam * light[2] * 450.0**2 / away**3
-        shade = np.where(mask, 0.5 * rng.random(), light_there)
-        photos.append((albedo * shade) ** 0.8)  # a phone's lift of what is dark
-    rgb = np.repeat(np.stack(photos)[..., None], 3, -1).astype(np.float32)
-    shadows = find_shadows(fit_ground_field(rgb, np.ones(rgb.shape[:3], bool)))
-    truth = np.stack([hits_ball(points, light) for light in lights]) & ~mask
-    dark = (shadows.visibility < 0.5) & ~mask
-    overlap = (dark & truth).sum((1, 2)) / np.maximum((dark | truth).sum((1, 2)), 1)
-    assert np.median(overlap) > 0.85
-    assert (shadows.object_mask & mask).sum() > 0.8 * mask.sum()

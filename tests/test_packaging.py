@@ -49,38 +49,16 @@ def test_every_package_tells_type_checkers_that_it_is_typed(wheel_names):
     }
 
 
-def test_the_wheel_brings_the_parts_of_the_stage(wheel_names):
-    there = {Path(n).name for n in (ROOT / "viewer" / "stage" / "assets").iterdir()}
-    assert {"stage.html", "stage.css", "main.js", "light.frag.glsl"} <= there
-    assert {Path(n).name for n in wheel_names if n.startswith("viewer/stage/assets/")} == there
-
-
-def test_the_wheel_brings_the_pages_of_the_studio(wheel_names):
-    there = {path.name for path in (ROOT / "viewer" / "studio_server" / "web").iterdir()}
-    assert {Path(n).name for n in wheel_names if n.startswith("viewer/studio_server/web/")} == there
-    assert {"index.html", "app.js", "phone.html", "studio.css"} <= there
+@pytest.mark.parametrize("folder", ["viewer/stage/assets", "viewer/studio_server/web"])
+def test_the_wheel_brings_the_parts_of_the_pages(wheel_names, folder):
+    there = {f"{folder}/{path.name}" for path in (ROOT / folder).iterdir()}
+    assert len(there) > 3 and {n for n in wheel_names if n.startswith(f"{folder}/")} == there
 
 
 def test_the_wheel_brings_the_example_of_the_studio(wheel_names):
     there = {path.name for path in (ROOT / "examples" / "spot").rglob("*") if path.is_file()}
     assert {Path(n).name for n in wheel_names if "/share/shadowgraph/examples/spot/" in n} == there
     assert f"viewer/studio/{RESULT.name}" in wheel_names
-
-
-def test_the_wheel_is_plain_python(wheel_names):
-    assert not [n for n in wheel_names if n.endswith((".so", ".pyd", ".c"))]
-
-
-def test_the_command_is_installed():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["scripts"] == {"shadowgraph": "shadowgraph.__main__:start"}
-
-
-def test_the_first_screen_of_the_readme_shows_the_two_commands():
-    first_screen = "\n".join((ROOT / "README.md").read_text().splitlines()[:40])
-    commands = re.findall(r"^    (.*)$", first_screen, re.MULTILINE)
-    assert any("pip install . " in c and "shadowgraph run examples/spot" in c for c in commands)
-    assert any("pip install '.[test]'" in c and "pytest" in c for c in commands)
 
 
 def test_each_command_of_the_readme_works_alone_in_a_fresh_clone():

@@ -26,13 +26,6 @@ def test_the_paper_s_preset_is_the_paper_s_settings():
     assert config.resolutions[0] == (0, 8) and config.resolutions[-1][1] == 1  # 100 px of 800 at first
 
 
-@pytest.mark.parametrize("field", ["grid", "neural", "hash"])
-def test_every_field_can_be_trained_with_every_preset(field):
-    assert training("paper", field, None, 3)[1] == TrainConfig(field=field, seed=3)
-    lengths = [training(name, field, None, 0)[1].iterations for name in ("draft", "standard", "fine")]
-    assert lengths == sorted(lengths) and lengths[-1] < TrainConfig().iterations
-
-
 def test_an_ablation_is_one_setting_of_either_solver():
     standard = preset("standard", 0)[1]
     changes = {

@@ -19,7 +19,7 @@ def passes_on(card: str) -> None:
     assert done.returncode == 0, done.stdout[-5000:]
 
 
-@pytest.mark.slow  # 130 s: fails only where a tensor is made on the wrong device
+@pytest.mark.slow  # a minute: fails only where a tensor is made on the wrong device
 def test_a_device_of_its_own_computes_what_the_cpu_does():
     if not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"):
         pytest.skip("this torch takes no devices that are written in Python")

@@ -10,13 +10,6 @@ def a_mesh() -> trimesh.Trimesh:
     return mesh
 
 
-@pytest.mark.parametrize("kept", [0, 3, 40, 200, 2000, -1])
-def test_a_file_that_was_cut_is_no_mesh(tmp_path, kept):
-    content = a_mesh().export(file_type="ply")
-    (tmp_path / "preview.ply").write_bytes(content[:kept])
-    assert read_preview(tmp_path / "preview.ply") is None
-
-
 @pytest.mark.parametrize(
     ("ours", "theirs"),
     [

@@ -11,9 +11,6 @@ from test_studio import capture_in
 from test_studio_browser import PHONE, opened
 from waiting import wait_until
 
-from capture.errors import CaptureError
-from capture.intake.arrivals import refuse_size
-
 
 def a_zip(**files: bytes) -> bytes:
     file = io.BytesIO()
@@ -86,14 +83,6 @@ def test_photos_that_will_not_be_used_are_named_and_counted(browser, tmp_path):
             said[count] = tab.evaluate("async (bad) => (await import('/upload.js')).unused(bad)", bad)
     for count, words in said.items():
         assert words.count("(unreadable)") == min(count, 4) and ("and 2 more." in words) == (count == 6)
-
-
-@pytest.mark.parametrize(
-    ("name", "size", "words"), [("a.jpg", 0, "is empty"), ("a.mp4", 0, "is empty"), ("a.jpg", 10**12, "at most")]
-)
-def test_a_file_without_bytes_or_with_too_many_is_refused_in_words_that_fit(tmp_path, name, size, words):
-    with pytest.raises(CaptureError, match=words):
-        refuse_size(name, size, tmp_path)
 
 
 @pytest.mark.browser

@@ -94,16 +94,6 @@ def test_the_report_asks_no_server_for_anything(whole_page):
     assert "default-src 'none'" in whole_page
 
 
-def test_names_and_reasons_from_files_are_text_and_not_page(run, tmp_path):
-    report = json.loads((run / "report.json").read_text())
-    report["warnings"] = ["<script>alert(1)</script>"]
-    report["photos"][0] |= {"name": '"><img src=x onerror=alert(1)>.jpg', "used": False, "reason": "<b>"}
-    (tmp_path / "report.json").write_text(json.dumps(report))
-    read = Reader(page_of(tmp_path))
-    assert "script" not in read.tags and "img" not in read.tags
-    assert "<script>alert(1)</script>" in read.text
-
-
 def test_a_run_that_stopped_early_says_where_and_why(tmp_path, truth):
     fake_run.start_run(tmp_path, truth)
     assert "There is no mesh. Stopped while fitting the surface." in Reader(page_of(tmp_path)).text

@@ -51,33 +51,19 @@ def test_the_file_keeps_the_contract(tmp_path):
     [
         (("format",), 2, "format"),
         (("units",), "inch", "units"),
-        (("camera", "fx"), float("nan"), "camera.fx"),
         (("camera", "fx"), -3, "camera.fx"),
-        (("camera", "fx"), 1e300, "camera.fx"),
         (("camera", "fx"), 1e12, "camera.fx"),
-        (("camera", "width"), 640.5, "camera.width"),
-        (("camera", "distortion"), [0, 0], "camera.distortion"),
         (("camera", "sigmas", "fx"), -1, r"camera.sigmas is .*in each entry"),
         (("camera", "world_from_camera", 0, 0), 3.0, "camera.world_from_camera"),
         (("camera", "world_from_camera", 2, 3), -50.0, "camera.world_from_camera"),
         (("camera", "world_from_camera", 3), [0, 0, 1, 1], "camera.world_from_camera"),
         (("ground", "normal"), [0, 1, 0], "ground.normal"),
-        (("ground", "offset"), None, "ground.offset"),
         (("lights", 0, "position", 2), -10.0, r"lights\[0\].position"),
-        (("lights", 0, "position", 2), float("inf"), r"lights\[0\].position\[2\]"),
         (("lights", 0, "kind"), "ring", r"lights\[0\].kind"),
-        (("lights", 0, "used"), 1, r"lights\[0\].used"),
         (("lights", 0, "power", 1), -1.0, r"lights\[0\].power"),
         (("lights", 1, "direction"), [1, 1, 1], r"lights\[1\].direction"),
-        (("lights",), {}, "lights"),
-        (("lobe",), ["m"], r"lobe\[0\]"),
-        (("residuals", "reprojection_rms_px"), float("nan"), "residuals.reprojection_rms_px"),
         (("residuals", "camera_height_sigma_mm"), "x", "camera_height_sigma_mm is 'x'"),
-        (("residuals", "notes"), [1], r"notes\[0\] is 1"),
-        (("lights", 1, "sigma"), [1, 2], r"sigma is \[1, 2\]; needed: a list of length 3"),
         (("lights", 0, "photo"), "../../secret", r"lights\[0\]\.photo is .*the name of a file"),
-        (("lights", 0, "photo"), "", r"lights\[0\]\.photo is .*the name of a file"),
-        (("lights", 0, "photo"), "a\0b", r"lights\[0\]\.photo is .*the name of a file"),
     ],
 )
 def test_a_wrong_field_is_refused_by_name(tmp_path, path, value, named):
@@ -104,3 +90,14 @@ def test_nothing_is_written_when_a_number_is_not_finite(tmp_path):
     with pytest.raises(CalibrationError, match=r"ground\.offset"):
         save_calibration(bad, tmp_path / "c.json")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_light_is_a_point_or_a_direction_and_nothing_else():
+    with pytest.raises(ValueError, match="point with a position"):
+        Light("a", "point", direction=np.array([0.0, 0.0, 1.0]))
+
+
+@pytest.mark.parametrize("matrix", [np.diag([1.0, 1, -1]), 1.01 * np.eye(3), np.full((3, 3), np.nan)])
+def test_a_mirror_a_scaling_and_nan_are_no_rotations(matrix):
+    with pytest.raises(ValueError):
+        Pose(matrix, np.zeros(3))

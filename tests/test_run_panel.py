@@ -1,22 +1,15 @@
 """Steering a run from its page, and the comparison of photos with what the surface explains."""
 
-import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
 import fake_run
 import numpy as np
-import psutil
 import pytest
 
 from capture.photos.photo import encode_srgb
-from reconstruct.run_folder.lock import is_abandoned
-from reconstruct.run_folder.requests import PAUSED, make_request, open_requests
+from reconstruct.run_folder.requests import PAUSED, open_requests
 from reconstruct.sdf.grid import SdfGrid
-from viewer.display.run_follower import RunFollower
 from viewer.page.page import Page
 from viewer.report.pictures import computed_picture, is_shadow_picture
 
@@ -37,14 +30,6 @@ def press(button) -> None:
 def choose(dropdown, value) -> None:
     dropdown.value = value
     press(dropdown)
-
-
-def gone() -> dict:
-    """A lock of a process that has ended."""
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    born = psutil.Process(ended.pid).create_time()
-    ended.wait()
-    return {"pid": ended.pid, "started": born}
 
 
 # --- requests --------------------------------------------------------------------------------------------------------
@@ -81,37 +66,7 @@ def test_one_resolution_is_asked_for_at_a_time_and_can_be_taken_back(page, tmp_p
     assert run._resolution.value == "as planned"
 
 
-def test_a_killed_run_counts_as_stopped_and_a_pause_left_over_is_named(page, tmp_path):
-    make_request(tmp_path, "pause")
-    (tmp_path / "lock").write_text(json.dumps(gone()))
-    page.refresh()
-    assert page.is_over and "Stopped while fitting the surface" in page.controls._status.content
-    run, said = page.controls.steering, page.controls._status.content
-    assert "The same command goes on" in said and "is forgotten then" in said
-    assert not any(control.visible for control in (run._pause, run._go_on, run._next, run._stop, run._resolution))
-
-
-@pytest.mark.parametrize("content", ["", "{}", "[]", "no JSON"])
-def test_a_lock_that_cannot_be_read_yet_belongs_to_a_run(tmp_path, content):
-    (tmp_path / "lock").write_text(content)
-    assert not is_abandoned(tmp_path / "lock") and RunFollower(tmp_path).is_running()
-    me = psutil.Process()
-    (tmp_path / "lock").write_text(json.dumps({"pid": os.getpid(), "started": me.create_time()}))
-    assert not is_abandoned(tmp_path / "lock")
-    assert not RunFollower(tmp_path / "elsewhere").is_running()
-
-
 # --- the shadow hull and the comparison -----------------------------------------------------------------------------
-
-
-def test_the_shadow_hull_is_a_layer_of_its_own_that_is_off_at_first(page, tmp_path, truth):
-    assert page._hull is None
-    fake_run.mesh_of(fake_run.fields_of(truth), inflate=9.0).export(tmp_path / "hull.ply")
-    page.refresh()
-    assert page._hull is not None and not page._hull.visible
-    page.controls._layers["Shadow hull"].value = True
-    page._show_layers()
-    assert page._hull.visible
 
 
 def thumbs_of(truth, calibration) -> dict:

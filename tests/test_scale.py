@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import torch
 from dataset_folders import from_above, write_rti
-from synthetic import Look, Sphere, render
+from synthetic import Look, Sphere, grid_of, render
 
 from capture.errors import CaptureError
 from capture.session.session import load_settings, parse_length
 from reconstruct.fields import SolvedScene
 from reconstruct.scene import irradiance
-from reconstruct.sdf.grid import SdfGrid
 from reconstruct.source.calibrate_source import in_millimetres, with_scale_of
 from reconstruct.source.source import RunOptions, open_source
 
@@ -22,11 +21,9 @@ ON_GROUND = Sphere((0.0, 0.0, RADIUS), RADIUS)
 
 def solved(truth, scene) -> SolvedScene:
     """The sphere itself as a solved scene, in units of the scene."""
-    nodes = np.stack(np.meshgrid(*[np.arange(-30.0, 61.0, 2.0)] * 3, indexing="ij"), -1)
-    values = np.linalg.norm(nodes - ON_GROUND.centre, axis=-1) - RADIUS
-    grid = SdfGrid(torch.from_numpy(values).float(), torch.full((3,), -30.0), 2.0)
     albedo = torch.zeros(*scene.directions.shape)
-    return SolvedScene(grid, albedo, scene.camera, scene.world_from_camera, 0.0, "scene", scene.lights)
+    place = (scene.camera, scene.world_from_camera, 0.0, "scene", scene.lights)
+    return SolvedScene(grid_of((ON_GROUND,), 2.0), albedo, *place)
 
 
 @pytest.mark.parametrize(("is_known", "what"), [(True, "height above the ground"), (False, "largest extent")])

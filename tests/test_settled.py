@@ -99,16 +99,6 @@ def test_every_ray_that_contradicts_its_label_is_chosen():
     assert chosen_rays(0.0, label, seen)[spoilt].mean() > 0.97  # but dark labels where a surface faces away
 
 
-def test_of_a_share_of_the_pixels_the_same_rays_are_chosen():
-    seen = views()
-    label = labels(seen)
-    every, some = chosen_rays(0.5, label, seen), chosen_rays(0.5, label, seen, 0.3)
-    assert 0.2 * every.sum() < some.sum() < 0.4 * every.sum()
-    needed = misses(ball(RADIUS), seen, label) > 0.003
-    taken = np.random.default_rng(0).random(WIDTH * HEIGHT) < 0.3
-    assert some[:, taken][needed[:, taken]].all() and not some[:, ~taken].any()
-
-
 @pytest.mark.parametrize("radius", [3.0, RADIUS, 20.0])
 def test_beyond_the_band_the_wide_field_is_at_most_the_distance_and_grows_with_it(radius):
     nodes = np.stack(np.meshgrid(*[np.arange(0, NODES, WIDE)] * 3, indexing="ij"), -1)

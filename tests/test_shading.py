@@ -55,9 +55,9 @@ def test_positions_are_found_to_half_a_per_cent_despite_object_shadows_and_textu
 @pytest.mark.parametrize(("near", "reach"), [(0.24, (380, 850)), (2.2, (250, 700))])
 def test_lights_are_found_wherever_the_camera_stands(near, reach):
     """From a coin seen from 150 mm to a chair seen from 1.4 m: a hand holds the light as far away as ever."""
-    recipe = Recipe(near=near, lights=handheld_lights(12, np.random.default_rng(7), reach))
+    recipe = Recipe(near=near, lights=handheld_lights(8, np.random.default_rng(7), reach))
     truth = photograph(recipe)
-    found = locate_lights(truth.stack, recipe.posed_camera(), np.ones(12, bool))
+    found = locate_lights(truth.stack, recipe.posed_camera(), np.ones(8, bool))
     errors = truth.errors(found.lights)
     assert all(light.used for light in found.lights)
     assert np.median(errors) < 0.03
@@ -122,12 +122,6 @@ def test_beams_that_are_not_round_are_noticed_and_cost_little():
     assert found.residuals["beam_asymmetry"] == pytest.approx(0.03, abs=0.01)
     assert np.median(truth.errors(found.lights)) < 0.008  # 0.03 with round beams
     assert truth.share_inside(found.lights) >= 0.8
-
-
-def test_six_photos_do_not_show_whether_the_beam_is_round_and_say_so():
-    truth = photograph(Recipe(n_photos=6, asymmetry=0.03))
-    found = locate_lights(truth.stack, POSED_CAMERA, every(truth.stack))
-    assert truth.share_inside(found.lights) > 0.8
 
 
 @pytest.mark.parametrize(

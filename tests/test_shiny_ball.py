@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from dataset_folders import from_above, towards_lights, write_photo
-from synthetic import Look, Sphere, render
+from synthetic import Box, Look, Sphere, grid_of, render
 
 from calibration.camera import Camera
 from calibration.lights.shiny_ball import Ball
@@ -13,7 +13,6 @@ from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError, CaptureError
 from reconstruct.fields import SolvedScene
 from reconstruct.run.ball_on_ground import without_ball
-from reconstruct.sdf.grid import SdfGrid
 from reconstruct.source.calibrate_source import calibrate_source
 from reconstruct.source.photos import read_photos
 from reconstruct.source.source import RunOptions, open_source
@@ -87,10 +86,7 @@ def test_on_a_known_ground_the_ball_is_cut_from_the_surface():
     """A ball of radius 5 at (10, 0), seen from 1000 above where a pixel is 1 wide on the ground; a cube stays."""
     camera = Camera(100, 100, 1000.0, 1000.0, 49.5, 49.5)
     posed = PosedCamera(camera, Pose(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 1000.0])), 0.0)
-    nodes = np.stack(np.meshgrid(np.arange(-20.0, 21), np.arange(-20.0, 21), np.arange(-2.0, 13), indexing="ij"), -1)
-    ball = np.linalg.norm(nodes - [10.0, 0, 5], axis=-1) - 5
-    cube = np.abs(nodes - [-10.0, 0, 4]).max(-1) - 4
-    grid = SdfGrid(torch.from_numpy(np.minimum(ball, cube)).float(), torch.tensor([-20.0, -20, -2]), 1.0)
+    grid = grid_of((Sphere((10.0, 0.0, 5.0), 5.0), Box((-14.0, -4.0, 0.0), (-6.0, 4.0, 8.0))), 1.0)
     fields = SolvedScene(grid, torch.zeros(100, 100, 3), camera, posed.world_from_camera, 0.0, "scene")
     left = without_ball(fields, (59.5, 49.5, 1.1 * 5), posed).grid
     assert float(left.sdf(torch.tensor([[10.0, 0, 5]]))) > 4 and float(left.sdf(torch.tensor([[10.0, 0, 9.5]]))) > 0

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from flashlight_photos import looking_at
 from test_session import names, save_capture
 
 from calibration.board.board import Board
@@ -13,7 +14,6 @@ from calibration.board.corners import Corners
 from calibration.calibration import Calibration, load_calibration, save_calibration
 from calibration.camera import Camera
 from calibration.ground.shadow_reach import most_height
-from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.side_photos.ground_look import TripodView, stood_there
 from calibration.side_photos.side_views import TripodObject, side_pose
@@ -29,19 +29,12 @@ FOOT = BALL * [1, 1, 0]
 EYE, SIDE = np.array([0.0, -420.0, 330.0]), np.array([460.0, -60.0, 240.0])
 
 
-def look_at(eye, target):
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return Pose(np.stack([right, np.cross(forward, right), forward], 1), eye)
-
-
 PALE, BLACK = np.array([0.42, 0.40, 0.38]), np.array([0.006, 0.005, 0.006])
 
 
 def picture(eye, rng, ball=True, colour=PALE):
     """A table of coarse grain, a ball and its soft shadow, in room light; and where the ball is."""
-    camera = PosedCamera(CAMERA, look_at(eye, np.array([60.0, 40.0, 20.0])), 0.0)
+    camera = PosedCamera(CAMERA, looking_at(eye, np.array([60.0, 40.0, 20.0])), 0.0)
     rays = camera.rays(CAMERA.pixel_grid())
     table = camera.on_ground(CAMERA.pixel_grid())
     grain = np.sin(table[..., 0] / 4 + 2 * np.sin(table[..., 1] / 31)) + np.sin(table[..., 1] / 9)
@@ -78,7 +71,7 @@ def test_a_height_that_is_none_is_refused(tmp_path, text):
 def test_the_pose_is_found_although_the_phone_has_refocused():
     board = Board("checkerboard", 9, 6, 24.0)
     points = board.points()
-    pose = look_at(np.array([330.0, -260.0, 250.0]), points.mean(0))
+    pose = looking_at(np.array([330.0, -260.0, 250.0]), points.mean(0))
     refocused = replace(CAMERA, fx=CAMERA.fx * 1.015, fy=CAMERA.fy * 1.015)
     rng = np.random.default_rng(0)
     pixels = refocused.project(pose.inverse().apply(points)) + 0.1 * rng.standard_normal((len(points), 2))
@@ -141,9 +134,9 @@ def test_a_table_without_an_object_has_no_silhouette():
 def test_side_views_are_saved_with_the_calibration(tmp_path):
     mask = np.zeros((40, 50), bool)
     mask[10:30, 12:31] = True
-    posed = PosedCamera(CAMERA, look_at(SIDE, BALL), 0.0)
+    posed = PosedCamera(CAMERA, looking_at(SIDE, BALL), 0.0)
     view = SideView("IMG_5.jpg", posed, (20, 30, 100, 80), mask, ~mask, 0.4)
-    saved = Calibration.of(PosedCamera(CAMERA, look_at(EYE, BALL), 0.0), (), side_views=(view,))
+    saved = Calibration.of(PosedCamera(CAMERA, looking_at(EYE, BALL), 0.0), (), side_views=(view,))
     save_calibration(saved, tmp_path / "calibration.json")
     loaded = load_calibration(tmp_path / "calibration.json")
     assert loaded == saved

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from synthetic import BALL, Look, render
+from synthetic import BALL, Look, grid_of, render
 
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import supervise
-from reconstruct.scene import Scene
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import find_surface
 from reconstruct.solve import solver
@@ -50,11 +49,6 @@ def of_shadows(kind):
     return fit(scene, SMALL, listener), scene, truth, listener
 
 
-@pytest.mark.slow  # the same under near lights: test_evidence.py, which has that solve anyway
-def test_shadows_alone_give_the_ball_under_distant_lights():
-    assert_ball(*of_shadows("directional"))
-
-
 def assert_ball(fields, scene, truth, listener):
     """Near the truth, and every iteration tells its error."""
     error = depth_error(fields, scene, truth)
@@ -76,11 +70,8 @@ def test_photos_alone_give_the_ball():
 def test_the_true_surface_is_left_alone_by_its_own_shadows():
     scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=24, kind="directional"))
     scene = replace(scene, rgb=None)
-    spacing, origin = 1.5, np.array(BALL.centre) - 1.3 * BALL.radius
-    axes = (np.arange(int(2.6 * BALL.radius / spacing)) * spacing + o for o in origin)
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    phi = (np.linalg.norm(nodes - np.array(BALL.centre), axis=-1) - BALL.radius) / spacing
-    surface = LevelSet(phi.astype(np.float32), origin, spacing)
+    true = grid_of((BALL,), 1.5)
+    surface = LevelSet(true.values.numpy() / true.spacing, true.origin.double().numpy(), true.spacing)
     rays = supervise(scene, assemble_labels(scene, None, None))
     shoot = RayPasses(surface, scene, rays, FitConfig(rays=20_000))
     for i in range(40):
@@ -93,22 +84,6 @@ def test_the_true_surface_is_left_alone_by_its_own_shadows():
     points = scene.eye + torch.from_numpy(truth.depth)[..., None] / (scene.directions @ scene.forward)[..., None] * (
         scene.directions
     )
-    off = surface.grid().sdf(points[torch.from_numpy(truth.mask)].float()).abs() / spacing
+    off = surface.grid().sdf(points[torch.from_numpy(truth.mask)].float()).abs() / true.spacing
     # Dark labels of the side that faces away from its light would ask for a bulge.
     assert float(off.mean()) < 0.2  # voxels; 0.25 while those labels counted
-
-
-PIXEL = 2.1  # mm at the ball
-
-
-def noisy(clean: Scene) -> Scene:
-    flipped = torch.rand(clean.shadow.shape, generator=torch.Generator().manual_seed(1)) < 0.02
-    return replace(clean, shadow=torch.where(flipped, 1 - clean.shadow, clean.shadow))
-
-
-@pytest.mark.slow  # 9 s: two solves; the hull is tested above
-def test_two_per_cent_of_flipped_labels_double_the_depth_error_or_cost_less_than_half_a_pixel():
-    scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=24))
-    clean = replace(scene, rgb=None)
-    errors = [depth_error(fit(each, SMALL, Listener()), scene, truth) for each in (clean, noisy(clean))]
-    assert errors[1] < max(2 * errors[0], 0.5 * PIXEL)

@@ -170,22 +170,6 @@ def test_what_is_known_has_its_legend_with_the_menu_closed_and_text_can_be_read_
     assert not tab.locator("#legend").is_visible()
 
 
-def test_one_click_shares_the_page_as_one_file_that_works(browser, run, window, tmp_path):
-    with window.expect_download() as download:
-        window.click("#share")
-    file = tmp_path / "shared.html"
-    download.value.save_as(file)
-    assert download.value.suggested_filename == f"{run.name}.html"
-    other = browser.new_page(viewport=SMALL)
-    other.context.set_offline(True)
-    other.add_init_script(NO_DRAWING)
-    other.goto(file.as_uri())
-    wait_samples(other, 1)
-    home = window.evaluate("JSON.parse(document.getElementById('scene').textContent).cameras[0].home.azimuth")
-    assert state(other)["view"]["azimuth"] == home and other.locator("#problem").is_hidden()
-    other.close()
-
-
 def numbers(css: str) -> list[float]:
     return [float(x) for x in re.findall(r"[\d.]+", css)]
 

@@ -303,7 +303,9 @@ def test_a_bug_report_tells_nothing_of_where_the_photos_were_taken(run, tmp_path
     said = {"command": f"shadowgraph run {home}/scans/vase", "warnings": [f"{home}/scans/vase/a.jpg is blurred"]}
     document_with(run, "report.json", lambda d: d.update(said))
     write_report(run)
-    write_bundle(run, tmp_path / "b.zip", with_pictures=True)
+    assert not [name for name in write_bundle(run, tmp_path / "a.zip") if name.endswith((".jpg", ".png"))]
+    names = write_bundle(run, tmp_path / "b.zip", with_pictures=True)
+    assert {"log.jsonl", "report.html", "report.json", "calibration.json", "manifest.json", "machine.json"} <= {*names}
     with zipfile.ZipFile(tmp_path / "b.zip") as packed:
         contents = {name: packed.read(name) for name in packed.namelist()}
     assert sum(name.startswith("thumbs/") for name in contents) == 6

@@ -1,12 +1,10 @@
 """The studio in a browser: with the mouse alone, with the keyboard alone, and on a phone's screen."""
 
-import os
 from pathlib import Path
 
 import pytest
 from chromium import NO_DRAWING, PATIENCE_MS
 from studio_client import served
-from test_intake import jpeg
 from test_studio import capture_in, run_in
 
 pytestmark = pytest.mark.browser
@@ -30,50 +28,6 @@ def opened(browser, client, size, is_drawn: bool = True):
     tab.on("request", lambda r: None if r.url.startswith((address, "data:", "blob:")) else bad.append(r.url))
     tab.goto(address)
     return tab, bad
-
-
-def test_from_an_empty_folder_to_a_run_with_the_mouse_alone(browser, tmp_path):
-    folder, photos = tmp_path / "studio", tmp_path / "set" / "photos"
-    photos.mkdir(parents=True)
-    for number in range(4):
-        (photos / f"IMG_{number}.jpg").write_bytes(jpeg(number))
-    with served(folder) as (_, _, owner):
-        tab, bad = opened(browser, owner, DESKTOP)
-        tab.click("main .panel button.main")
-        tab.click("dialog button.main")
-        with tab.expect_file_chooser() as chooser:
-            tab.click("text=Choose a folder")
-        chooser.value.set_files(str(photos.parent))
-        tab.wait_for_selector("text=4 of 4 files are here.")
-        assert not tab.evaluate(RULES)
-        tab.click("text=Start")
-        tab.wait_for_selector("text=Its photos")
-        tab.click("text=All captures")
-        tab.wait_for_selector(".card")
-        assert not tab.evaluate(RULES) and not bad
-    assert sorted(p.name for p in (folder / "captures" / "Capture" / "photos").iterdir()) == [
-        f"IMG_{number}.jpg" for number in range(4)
-    ]
-    assert (folder / "runs" / "Capture-draft").is_dir()
-
-
-@pytest.mark.slow
-def test_a_phone_that_left_in_the_middle_is_said_on_the_page_and_can_be_gone_on_without(browser, tmp_path):
-    capture_in(tmp_path, "vase")
-    with served(tmp_path) as (_, _, owner):
-        address = owner.create("vase", "IMG_9.jpg", 3000).headers["Location"]
-        owner.piece(address, 0, jpeg(9)[:1000])
-        (file,) = (tmp_path / ".studio" / "uploads").glob("*.part")
-        os.utime(file, (1e9, 1e9))
-        tab, bad = opened(browser, owner, PHONE)
-        tab.wait_for_selector("text=stopped in the middle: the sender has left")
-        tab.click(".card a.face")
-        tab.wait_for_selector("text=Starts once all photos are here.")
-        assert not tab.evaluate(RULES)
-        tab.click("text=Go on without")
-        tab.wait_for_selector("text=Go on without", state="detached")
-        tab.wait_for_selector("button:has-text('Start'):not([disabled])")
-        assert not bad
 
 
 @pytest.mark.slow

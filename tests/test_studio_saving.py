@@ -113,16 +113,6 @@ def test_a_video_says_how_far_it_is_lets_others_pass_and_is_cancelled(folder):
         wait_until(lambda: (row_of(owner, "turntable").get("share") or 0.0) > 0.0)  # after a cancelled one
 
 
-@pytest.mark.slow
-def test_a_file_that_failed_keeps_its_sentence_until_it_is_asked_for_anew(folder):
-    with served(folder) as (_, _, owner):
-        owner.ok("save", key=RUN, format="3mf", size="0")
-        wait_until(lambda: row_of(owner, "3mf")["error"])
-        assert "no size to print" in row_of(owner, "3mf")["error"]
-        assert owner.post("save", key=RUN, format="3mf", size="0")[0] == 400
-        assert not row_of(owner, "3mf")
-
-
 def test_a_run_under_way_shows_its_photos_and_then_the_growing_surface(tmp_path, truth):
     run = tmp_path / "runs" / "heap"
     fake_run.start_run(run, truth)

@@ -55,15 +55,6 @@ def test_shaded_normals_are_those_of_the_full_surface(fields, baked):
     assert np.median(angle) < 1.5 and np.percentile(angle, 95) < 6
 
 
-def test_the_normal_map_keeps_what_reducing_the_mesh_lost(fields, baked):
-    places, shaded, _ = sampled(baked)
-    flat = np.cross(*(baked.vertices[baked.faces][:, k] - baked.vertices[baked.faces][:, 0] for k in (1, 2)))
-    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
-    wanted = torch.nn.functional.normalize(fields.grid.gradient(torch.from_numpy(places).float()), dim=-1).numpy()
-    high = places[:, 2] > 4
-    assert np.median((shaded * wanted).sum(1)[high]) > np.median((flat * wanted).sum(1)[high])
-
-
 def test_colours_are_those_of_the_photo(fields, baked):
     places, _, base = sampled(baked)
     seen = (places[:, 1] < -5) & (places[:, 2] > 20)  # towards the camera

@@ -15,7 +15,7 @@ from reconstruct.shadowneus.camera_rays import (
     light_left_telescoped,
     place_samples,
 )
-from reconstruct.shadowneus.config import ABLATIONS, ShadowSamples, TrainConfig, ablated, shortened_training
+from reconstruct.shadowneus.config import ShadowSamples, TrainConfig
 from reconstruct.shadowneus.train_step import bound_loss, contain_loss
 from reconstruct.shadowneus.trainer import learning_factor
 from reconstruct.torch_sdf import equations as render
@@ -152,16 +152,3 @@ def test_the_learning_rate_warms_up_and_falls_to_its_last_value():
     assert math.isclose(learning_factor(150_000, config), 0.05)
     middle = learning_factor(77_500, config)
     assert math.isclose(middle, 0.525)
-
-
-def test_a_shorter_training_keeps_the_shape_of_its_schedule():
-    short = shortened_training(TrainConfig(), 1500)
-    assert (short.warm_up, short.cosine_anneal, short.foreground_anneal) == (50, 250, 50)
-    assert short.resolutions == ((0, 8), (50, 4), (100, 2), (150, 1))
-
-
-@pytest.mark.parametrize("name", ABLATIONS)
-def test_every_ablation_changes_one_setting(name):
-    base = TrainConfig(use_telescoped=name == "sampled")
-    changed = ablated(base, name)
-    assert sum(getattr(base, key) != getattr(changed, key) for key in vars(base)) == 1

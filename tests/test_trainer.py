@@ -21,7 +21,7 @@ from reconstruct.shadowneus.mlp_field import Network
 from reconstruct.shadowneus.model import Model
 from reconstruct.shadowneus.train_pixels import make_train_pixels
 from reconstruct.shadowneus.train_step import losses
-from reconstruct.shadowneus.trainer import finished, iterations, load_training, save_training, train
+from reconstruct.shadowneus.trainer import iterations, load_training, save_training, train
 from reconstruct.shadowneus.unit_frame import object_frame, unit_height
 
 BALL = Sphere((12.0, -6.0, 32.0), 32.0)
@@ -77,19 +77,6 @@ def errors(fields, scene, truth) -> tuple[float, float]:
     depth = np.abs(maps.depth.numpy() - truth.depth)[both].mean() / BALL.radius
     cosine = (maps.normals.numpy() * truth.normals).sum(-1)[both].clip(-1, 1)
     return float(depth), float(np.degrees(np.arccos(cosine)).mean())
-
-
-@pytest.mark.slow  # 9 s; that shadows pull at every field, and the right way, is tested below
-def test_shadows_alone_train_the_network_to_the_ball(shadows, frame):
-    scene, truth = shadows
-    start = finished(Model(MINIATURE, unit_height(0.0, frame)), scene, frame, MINIATURE)
-    depth_before, _ = errors(start, scene, truth)
-    listener = Listener()
-    depth, normal = errors(train(scene, MINIATURE, listener), scene, truth)
-    assert depth_before > 0.2
-    assert 1e-3 < depth < 0.2 and 0.5 < normal < 17
-    told = [line[:3] for line in listener.lines]
-    assert told == sorted(told) and {("solve", n, 100) for n in range(10, 101, 10)} <= set(told)
 
 
 @pytest.mark.slow  # 6 s; from photos a mesh is trained by the command, below

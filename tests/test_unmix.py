@@ -1,13 +1,8 @@
 """Coverage of outline pixels, from photos whose mixture is known."""
 
-from dataclasses import replace
-
 import numpy as np
-import pytest
 import torch
-from synthetic import BALL, Look, render
 
-from reconstruct.labels.ground_test import test_ground as check_ground
 from reconstruct.labels.matting import coverage_at_edges
 
 N_PHOTOS = 12
@@ -38,17 +33,3 @@ def test_an_outline_drawn_a_pixel_too_wide_moves_back():
     wide = torch.nn.functional.max_pool2d((covered > 0.5).float()[None], 3, 1, 1)[0] > 0
     mask = coverage_at_edges(photos[..., None], wide)
     assert torch.equal(mask[12:18] > 0.5, covered[12:18] > 0.5)
-
-
-@pytest.mark.slow
-def test_a_round_object_is_covered_as_far_as_its_outline():
-    scene, truth = render((BALL,), Look(width=480, height=360, n_lights=20))
-    small, _ = render((BALL,), Look(width=120, height=90, n_lights=20))
-    assert scene.rgb is not None
-    shrunk = torch.nn.functional.avg_pool2d(scene.rgb.movedim(-1, 1), 4).movedim(1, -1)
-    true = torch.nn.functional.avg_pool2d(torch.from_numpy(truth.mask).float()[None], 4)[0]
-    found = check_ground(replace(small, rgb=shrunk)).mask
-    edge = (true > 0.1) & (true < 0.9)
-    error = (found - true)[edge]
-    assert abs(float(error.mean())) < 0.05 and float(error.abs().median()) < 0.03
-    assert ((found > 0.5) != (true > 0.5)).sum() <= 0.1 * edge.sum()

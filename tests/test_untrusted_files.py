@@ -38,13 +38,13 @@ assert reconstruct.run.pipeline  # imported before files are watched
 
 
 class Payload:
-    """Unpickling it writes a file."""
+    """Unpickling it makes a folder, which nobody else does."""
 
     def __init__(self, path: Path):
         self.path = path
 
     def __reduce__(self):
-        return os.system, (f"touch '{self.path}'",)
+        return os.mkdir, (str(self.path),)
 
 
 def png(width: int, height: int, data: bytes = b"") -> bytes:

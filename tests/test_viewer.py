@@ -10,7 +10,6 @@ from PIL import Image
 from capture.photos.photo import encode_srgb
 from viewer.display import layers
 from viewer.display.layers import (
-    CAMERA_DISTANCE,
     FIRST_FOV,
     framed_view,
     light_position,
@@ -100,24 +99,6 @@ def test_a_folder_in_which_nothing_changes_has_no_news(tmp_path):
     assert follower.has_news()
 
 
-def test_a_growing_mesh_is_sent_again_when_it_is_another_and_its_time_has_come(tmp_path, truth, server, monkeypatch):
-    monkeypatch.setattr("viewer.page.page.MIN_INTERVAL_S", 1e9)
-    fake_run.start_run(tmp_path, truth)
-    page = Page(tmp_path, server)
-    page.refresh()
-    first = page._mesh
-    fake_run.mesh_of(fake_run.fields_of(truth), inflate=3.0).export(tmp_path / "preview.ply")
-    page.refresh()
-    assert page._mesh is first, "its time has not come"
-    page._mesh_limit = RateLimit()
-    page.poll()
-    second = page._mesh
-    assert second is not first
-    page._mesh_limit = RateLimit()
-    page.refresh()
-    assert page._mesh is second
-
-
 # --- what is drawn ---------------------------------------------------------------------------------------------------
 
 
@@ -129,14 +110,6 @@ def test_a_mesh_of_very_many_triangles_is_simplified_for_the_page(tmp_path, monk
     shown = page_mesh(tmp_path / "mesh.ply")
     assert len(ball.faces) > 80_000 and 30_000 >= len(shown.faces) > 10_000
     np.testing.assert_allclose(np.ptp(shown.vertices, axis=0), ball.extents, rtol=0.01)
-
-
-def test_the_camera_stands_at_the_page_distance_whatever_the_unit(truth):
-    calibration = truth.calibration
-    scale = page_scale(calibration)
-    eye = calibration.world_from_camera.translation
-    np.testing.assert_allclose(np.linalg.norm(scale.to_page(eye - scale.centre)), CAMERA_DISTANCE)
-    assert scale.centre[2] == pytest.approx(calibration.ground_height)
 
 
 @pytest.mark.parametrize("aspect", [1.6, 1.0, 0.46])

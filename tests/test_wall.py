@@ -9,20 +9,17 @@ from scipy.integrate import dblquad
 from calibration.flashlight import wall as walls
 from calibration.flashlight.fit import fit_flashlights
 from calibration.flashlight.model import (
-    PER_FLASHLIGHT,
     Evidence,
     Flashlights,
-    _model,
     free_tangent,
-    jacobian,
     log_irradiance,
 )
-from calibration.flashlight.wall import WALL_TERMS, wall_light
+from calibration.flashlight.wall import wall_light
 from calibration.lights.ground_cells import GroundCells
 
 BEAM = np.array([2.0, 0.3, 0.0, 0.0])
 MIDDLE = np.array([20.0, -30.0, 0.0])
-PLACES = [(0.4, 300.0), (2.0, 350.0), (-1.5, 200.0)]  # azimuth, distance
+PLACES = [(2.0, 350.0), (-1.5, 200.0)]  # azimuth, distance
 
 
 def brute(azimuth, distance, light, axis, point):
@@ -71,21 +68,6 @@ def ground(n_photos: int, seed: int, wall) -> tuple[Evidence, Flashlights]:
 
 
 @pytest.mark.parametrize(("azimuth", "distance"), PLACES)
-def test_the_wall_and_the_powers_have_these_derivatives(azimuth, distance):
-    evidence, state = ground(5, 1, (azimuth, np.log(distance), 0.5))
-    flashlight, shared = jacobian(state, evidence)
-    n = len(state.positions)
-    full = PER_FLASHLIGHT * n + len(BEAM) + 4 + WALL_TERMS
-    step = np.zeros(full)
-    step[6 : PER_FLASHLIGHT * n : PER_FLASHLIGHT] = 1e-4
-    step[PER_FLASHLIGHT * n + len(BEAM) :][: 1 + WALL_TERMS] = 1e-4
-    there, back = (log_irradiance(state.moved(s, 0.0), evidence) for s in (step, -step))
-    linear = 1e-4 * (flashlight[..., 6] + shared[..., len(BEAM) :].sum(-1))
-    np.testing.assert_allclose((there - back) / 2, linear, atol=2e-7)
-    assert (_model(state, evidence)[6] > 0).all()
-
-
-@pytest.mark.parametrize(("azimuth", "distance"), PLACES[:2])
 def test_a_wall_keeps_lights_in_place_that_move_without_its_light(azimuth, distance, monkeypatch):
     evidence, truth = ground(10, 2, (azimuth, np.log(distance), 0.6))
     assert off(truth, evidence, truth) < 0.02

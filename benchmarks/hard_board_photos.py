@@ -9,7 +9,7 @@ from functools import cache
 
 import cv2
 import numpy as np
-from board_photos import look_at
+from board_photos import look_at  # pyright: ignore[reportMissingImports]
 
 from calibration.board.board import Board, parse_board
 from calibration.camera import Camera
