@@ -18,7 +18,7 @@ from pathlib import Path
 
 from capture.errors import CaptureError
 from capture.files.names import natural_order, refuse_no_folder
-from capture.session.places import by_place
+from capture.session.places import VIEWS, by_place
 from capture.session.roles import find_tripods
 from capture.session.seen import SeenPhotos
 from capture.session.session import (
@@ -33,7 +33,7 @@ from capture.session.session import (
     photos_in,
 )
 
-VIEWS, LIES = "view_", "turned_"  # beginnings of folder names
+LIES = "turned_"  # beginning of folder names, as VIEWS
 MOST_VIEWS, MOST_LIES = 24, 8
 
 

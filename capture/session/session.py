@@ -346,7 +346,7 @@ def _unread(folder: Path) -> str:
     """
     files = [path for path in folder.iterdir() if path.is_file() and not is_beside(path)]
     loose = [path for path in files if is_photo_name(path) or is_clip_name(path)]
-    if loose and any((folder / name).is_dir() for name in (ROLE_FOLDERS["board"], ROLE_FOLDERS["lit"])):
+    if loose and is_sorted(folder):
         return f"{len(loose)} photos or clips are beside its folders ({loose[0].name}, ...): move them into these."
     clips = clips_in(folder / ROLE_FOLDERS["lit"])
     return f"The clip photos/{clips[0].name} is not read beside photos: remove the clip or the photos." if clips else ""
