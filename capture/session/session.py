@@ -129,7 +129,7 @@ def load_session(folder: Path, common: SessionSettings | None = None, seen: Seen
         thickness = common.board_thickness_mm if thickness is None else thickness
         settings = structs.replace(settings, board=settings.board or common.board, board_thickness_mm=thickness)
     seen = SeenPhotos() if seen is None else seen
-    with naming_skipped(folder, ROLE_FOLDERS.values()) as skipped:
+    with naming_skipped(folder) as skipped:
         roles, left_out, notes = _roles(folder, settings, seen, needs_board=common is None)
     notes += skipped
     if is_sorted(folder) and "board" not in settings.roles:
