@@ -63,17 +63,12 @@ class Solution:
 
     lens: Lens
     x: Float[np.ndarray, " n"]  # the lens's numbers, pose of every photo, Sheet's c
-    covariance: Float[np.ndarray, "m m"]  # of the lens's numbers and the first photo's pose, possible waves included
+    sigma: Float[np.ndarray, " lens"]  # one sigma of the lens's numbers, possible waves included
     rms: tuple[float, ...]  # per photo, px
     sheet: Sheet | None
     waves: Waves
     pose_covariances: Float[np.ndarray, "photos 6 6"]  # of each photo's pose, likewise
     noise: float  # px, one sigma per axis of a corner
-
-    @property
-    def sigma(self) -> Float[np.ndarray, " lens"]:
-        """One sigma of the lens's numbers."""
-        return np.sqrt(np.diag(self.covariance)[: self.lens.n_numbers()])
 
     def poses(self) -> Float[np.ndarray, "photos 6"]:
         """Rotation vector and translation (mm), camera from world, of every photo."""
@@ -142,10 +137,10 @@ def solve(photos: Sequence[Corners], prior: Prior, start: Solution | None = None
             break
     _, slopes = problem.bent_by(sheet, waves.possible, waves).weighted(x)
     inverse, n_lens = np.linalg.inv(slopes.T @ slopes), prior.lens.n_numbers()
-    every = [problem.numbers(index) for index in range(len(photos))]
-    poses = np.array([inverse[np.ix_(own[n_lens:], own[n_lens:])] for own in every])
+    sigma, places = np.sqrt(np.diag(inverse)[:n_lens]), [problem.numbers(k)[n_lens:] for k in range(len(photos))]
+    poses = np.array([inverse[np.ix_(own, own)] for own in places])
     rms = tuple(float(np.sqrt((d**2).mean())) for d in problem.distances(x))
-    return Solution(prior.lens, x, inverse[np.ix_(every[0], every[0])], rms, sheet, waves, poses, problem.noise)
+    return Solution(prior.lens, x, sigma, rms, sheet, waves, poses, problem.noise)
 
 
 @dataclass(frozen=True)
@@ -237,10 +232,8 @@ def _settled(problem: _Problem, x: Float[np.ndarray, " n"]) -> tuple[_Problem, F
     for _ in range(ROUNDS):
         x = least_squares(problem.residuals, x, problem.jacobian, x_scale="jac", loss=problem.loss, max_nfev=STEPS).x
         _, slopes = problem.weighted(x)
-        spread = np.linalg.inv(slopes.T @ slopes)[bent:, bent:]
-        free = len(spread) - float(
-            (spread * (problem.held.T @ problem.held)).sum()
-        )  # c, where its prior does not hold it
+        root = np.linalg.qr(slopes, mode="r")[bent:, bent:]
+        free = len(root) - float(np.square(np.linalg.solve(root.T, problem.held.T)).sum())  # c, where not held
         before, problem = problem.noise, problem.measured(x, bent + free)
         if abs(problem.noise - before) <= SAME_NOISE * before:
             break
@@ -253,10 +246,9 @@ def _weighed(problem: _Problem, x: Float[np.ndarray, " n"], sheet: Sheet) -> Wav
     off, slopes = problem.weighted(x)
     weights = problem.loss(problem.residuals(x) ** 2)[1][n_lens + len(problem.held) :]
     off, slopes = (np.delete(one, np.s_[n_lens : n_lens + len(problem.held)], axis=0) for one in (off, slopes))
-    others, by_c = slopes[:, :bent], slopes[:, bent:]
-    flat = off - by_c @ x[bent:]
-    fitted = np.linalg.lstsq(others, np.column_stack([flat, by_c]), rcond=None)[0]  # all else to each c
-    flat, by_c = flat - others @ fitted[:, 0], by_c - others @ fitted[:, 1:]
+    at_flat = np.column_stack([slopes, off - slopes[:, bent:] @ x[bent:]])
+    reduced = np.linalg.qr(at_flat, mode="r")[bent:, bent:]  # all else fitted to each c
+    by_c, flat = reduced[:, :-1], reduced[:, -1]
     n = max(float(weights.sum()) - bent, 1.0)
     finest = FINEST_NOISE / problem.noise
     return weigh_waves(sheet, by_c.T @ flat, by_c.T @ by_c, float(flat @ flat), n, finest)

@@ -251,11 +251,8 @@ def _roles(
         if not clips:
             said = f"{error} Left out: {grouped(sound.left_out)}."
             raise (type(error)(said) if sound.left_out else error) from None
-        left_out, loose, stills = (
-            sound.left_out,
-            tuple(sound.by_role[""]),
-            replace(sound, by_role=sound.by_role | {"": []}),
-        )
+        left_out, loose = sound.left_out, tuple(sound.by_role[""])
+        stills = replace(sound, by_role=sound.by_role | {"": []})
         roles, notes = sorted_roles(stills, seen)[0], ()
         for clip in clips:
             frames = choose_frames(clip, settings.clip_frames)
