@@ -18,6 +18,7 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.checks.framing import NOT_COMPARED, NOT_SHOWN, REFRAMED, SEEN_FROM, ZOOM_STATED
+from capture.checks.registration import enlarged
 from capture.errors import CalibrationError, Remedy
 from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
@@ -69,9 +70,7 @@ def reframed(
         zoom = values.get(ZOOM_STATED, 0.0)
         return _less_sure(posed_camera, zoom), silent, Doubt(zoom)
     camera = posed_camera.camera
-    to_file = stack.full_width / stack.rgb.shape[2]
-    resize = np.array([[to_file, 0, 0.5 * to_file - 0.5], [0, to_file, 0.5 * to_file - 0.5], [0, 0, 1]])
-    homography = resize @ np.reshape(told.homography, (3, 3)) @ np.linalg.inv(resize)
+    homography = enlarged(np.reshape(told.homography, (3, 3)), stack.to_file)
     doubt = LEVER * told.value / camera.fx
     if told.kind == REFRAMED:
         found = _zoomed(posed_camera, homography, told.value)

@@ -108,14 +108,6 @@ class Board:
     dictionary: str = ""  # ChArUco only, OpenCV's name
     thickness_mm: ClassVar[float] = PAPER_THICKNESS  # from the table to its printed side, unless session.toml says it
 
-    def __post_init__(self):
-        if self.kind not in ("charuco", "checkerboard"):
-            raise ValueError(f"unknown kind of board {self.kind!r}")
-        if min(self.columns, self.rows) < 2 or not self.square_mm > 0:
-            raise ValueError("a board needs at least 2 x 2 and a positive square")
-        if self.kind == "charuco" and not 0 < self.marker_mm < self.square_mm:
-            raise ValueError("a ChArUco marker is smaller than its square")
-
     def spec(self) -> str:
         """The board as the text that parse_board reads."""
         text = f"{self.kind}:{self.columns}x{self.rows}:{_number(self.square_mm)}"

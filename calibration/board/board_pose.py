@@ -1,6 +1,5 @@
 """Estimate the camera's pose above the board with its uncertainty; ambiguous poses are refused."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -76,12 +75,32 @@ def fit_ground(
 ) -> GroundFit:
     """Fit the pose of the photo in which these corners were seen; the board's printed side is z = 0, mm.
 
+    Args:
+        spread: what a fit to several photos knows of this pose; unless given, the corners alone tell.
+        robust_at: px from which a corner begins to count less.
+
+    Raises:
+        CalibrationError: as best_view, or the ground's tilt is uncertain.
+    """
+    best = best_view(corners, camera, robust_at)
+    covariance = pose_covariance(best, corners, camera) if spread is None else spread.pose
+    normal_sigma, height_sigma, in_world = _uncertainty(best, corners, covariance, spread)
+    if normal_sigma > WORST_NORMAL:
+        raise CalibrationError(
+            f"board pose: the ground's tilt is uncertain by {np.degrees(normal_sigma):.1f} degrees, "
+            f"at most {np.degrees(WORST_NORMAL):.0f} needed. {_ADVICE}"
+        )
+    return GroundFit(best.camera_from_world.inverse(), best.rms(), normal_sigma, height_sigma, in_world)
+
+
+def best_view(corners: Corners, camera: Camera, robust_at: float = ROBUST_AT, is_refocused: bool = False) -> BoardView:
+    """Return the pose from which these corners were seen.
+
     A flat board seen from far away allows two poses (Collins and Bartoli's IPPE returns both). Both are refined to the
     smallest reprojection error; the better one is taken only if it wins clearly.
 
     Args:
-        spread: what a fit to several photos knows of this pose; unless given, the corners alone tell.
-        robust_at: px from which a corner begins to count less.
+        robust_at, is_refocused: as board_views takes them.
 
     Raises:
         CalibrationError: too few corners, a mirrored board, or two poses that explain them about equally well.
@@ -90,31 +109,34 @@ def fit_ground(
         raise CalibrationError(
             f"board pose: {len(corners.pixels)} corners seen, {FEWEST_CORNERS} needed. Keep the whole board in view."
         )
-    views = board_views(corners, camera, robust_at)
+    views = board_views(corners, camera, robust_at, is_refocused)
+    limit = WORST_MISFIT * max(camera.width, camera.height)
     if not views:
-        raise CalibrationError(f"board pose: {unexplained(corners, camera, robust_at)}.")
-    best, limit = views[0], WORST_MISFIT * max(camera.width, camera.height)
+        raise CalibrationError(f"board pose: {_unexplained(corners, camera, robust_at, limit)}.")
+    best = views[0]
     if best.misfit() > limit:
         raise CalibrationError(
             f"board pose: corners are {best.misfit():.1f} px off, at most {limit:.1f} px expected. "
-            "Check the board's columns and rows, and that it lies flat."
+            "Check the board's columns and rows, that it lies flat, and that the photo is sharp."
         )
-    _refuse_ambiguous(views, robust_at / 3)
-    covariance = pose_covariance(best, corners, camera) if spread is None else spread.pose
-    normal_sigma, height_sigma = _uncertainty(best, corners, covariance, spread)
-    if normal_sigma > WORST_NORMAL:
-        raise CalibrationError(
-            f"board pose: the ground's tilt is uncertain by {np.degrees(normal_sigma):.1f} degrees, "
-            f"at most {np.degrees(WORST_NORMAL):.0f} needed. {_ADVICE}"
-        )
-    in_world = _in_world(best, covariance)
-    return GroundFit(best.camera_from_world.inverse(), best.rms(), normal_sigma, height_sigma, in_world)
+    if len(views) > 1:
+        angle = float(np.arccos(np.clip(best.normal() @ views[1].normal(), -1, 1)))
+        sigma = max(robust_at / 3, best.rms())  # px: far off, Cauchy's loss counts little in units of a larger one
+        if angle > SAME_NORMAL and (views[1].cost - best.cost) / sigma**2 < CLEAR_WIN:
+            raise CalibrationError(
+                f"board pose: two views whose ground differs by {np.degrees(angle):.0f} degrees explain the corners "
+                f"equally well (errors of {best.rms():.2f} and {views[1].rms():.2f} px). {_ADVICE}"
+            )
+    return best
 
 
-def unexplained(corners: Corners, camera: Camera, robust_at: float = ROBUST_AT) -> str:
+_ADVICE = "Photograph the board larger and from a slant of 30 to 60 degrees, with all its corners in view."
+
+
+def _unexplained(corners: Corners, camera: Camera, robust_at: float, limit: float) -> str:
     """Return why board_views finds no pose; it says that the photo is mirrored only where a mirrored board fits."""
     views = board_views(replace(corners, points=corners.points * [-1.0, 1.0, 1.0]), camera, robust_at)
-    if views and views[0].misfit() <= WORST_MISFIT * max(camera.width, camera.height):
+    if views and views[0].misfit() <= limit:
         return (
             f"the board is seen mirrored ({views[0].misfit():.1f} px off; as printed, it fits no camera above the "
             "ground). Use the photo as the camera took it"
@@ -123,22 +145,6 @@ def unexplained(corners: Corners, camera: Camera, robust_at: float = ROBUST_AT) 
         f"no camera above the ground explains the {len(corners.pixels)} corners seen, not even if the photo was "
         "mirrored. Keep the whole board in view, and check its columns and rows"
     )
-
-
-_ADVICE = "Photograph the board larger and from a slant of 30 to 60 degrees, with all its corners in view."
-
-
-def _refuse_ambiguous(views: list[BoardView], noise: float) -> None:
-    if len(views) < 2:
-        return
-    best, other = views[:2]
-    angle = float(np.arccos(np.clip(best.normal() @ other.normal(), -1, 1)))
-    sigma = max(noise, best.rms())  # px: far off, Cauchy's loss counts little in units of a larger one
-    if angle > SAME_NORMAL and (other.cost - best.cost) / sigma**2 < CLEAR_WIN:
-        raise CalibrationError(
-            f"board pose: two views whose ground differs by {np.degrees(angle):.0f} degrees explain the corners "
-            f"equally well (errors of {best.rms():.2f} and {other.rms():.2f} px). {_ADVICE}"
-        )
 
 
 def board_views(
@@ -216,49 +222,32 @@ def reprojected(
     return corners.measured(pixels - corners.pixels, np.column_stack([full[:, :6], by_focal, full[:, 8:10]]))
 
 
-def _in_world(view: BoardView, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
-    """Return the covariance of turn w (rad) and shift c (mm): world_from_camera becomes exp(w) R, t + c.
+def _uncertainty(
+    view: BoardView, corners: Corners, covariance: Float[np.ndarray, "6 6"], spread: PoseSpread | None
+) -> tuple[float, float, Float[np.ndarray, "6 6"]]:
+    """Return one sigma of the normal (rad) and of the camera's height (mm), and the covariance of turn and place.
+
+    With a turn w (rad) and a shift c (mm) world_from_camera becomes exp(w) R, t + c.
 
     Args:
         covariance: of rotation vector and translation, camera from world.
     """
     back = view.camera_from_world.inverse()
 
-    def change(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "6"]:
+    def outcome(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "9"]:
         rotation = np.asarray(cv2.Rodrigues(x[:3])[0])
         turn = np.ravel(cv2.Rodrigues(rotation.T @ back.rotation.T)[0])
-        return np.concatenate([turn, -rotation.T @ x[3:] - back.translation])
+        return np.concatenate([rotation[:, 2], turn, -rotation.T @ x[3:] - back.translation])
 
-    return _propagated(change, view, covariance)
-
-
-def _uncertainty(
-    view: BoardView, corners: Corners, covariance: Float[np.ndarray, "6 6"], spread: PoseSpread | None
-) -> tuple[float, float]:
-    """Return one sigma of the normal (rad) and of the camera's height (mm)."""
-
-    def outcome(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4"]:
-        rotation = np.asarray(cv2.Rodrigues(x[:3])[0])
-        return np.append(rotation[:, 2], -(rotation.T @ x[3:])[2])
-
-    result = _propagated(outcome, view, covariance)
-    tilt, height = np.trace(result[:3, :3]), result[3, 3]
-    if spread is not None:
-        aside = view.camera_from_world.inverse().translation[:2] - corners.board.points()[:, :2].mean(0)
-        below = np.array([1.0, *aside])
-        tilt, height = tilt + np.trace(spread.table[1:, 1:]), height + below @ spread.table @ below
-    return float(np.sqrt(tilt)), float(np.sqrt(height))
-
-
-def _propagated(
-    outcome: Callable[[Float[np.ndarray, "6"]], Float[np.ndarray, " k"]],
-    view: BoardView,
-    covariance: Float[np.ndarray, "6 6"],
-) -> Float[np.ndarray, "k k"]:
-    """Return the covariance of what follows from a pose, by differences well inside the noise, well above rounding."""
+    # differences well inside the noise, well above rounding
     x, steps = view.numbers[:6], np.diag(np.sqrt(np.diag(covariance)) * 1e-2 + 1e-9)
     slope = np.stack([(outcome(x + d) - outcome(x - d)) / (2 * d.sum()) for d in steps], 1)
-    return slope @ covariance @ slope.T
+    found = slope @ covariance @ slope.T
+    tilt, height = np.trace(found[:3, :3]), found[8, 8]
+    if spread is not None:
+        below = np.append(1.0, back.translation[:2] - corners.board.points()[:, :2].mean(0))
+        tilt, height = tilt + np.trace(spread.table[1:, 1:]), height + below @ spread.table @ below
+    return float(np.sqrt(tilt)), float(np.sqrt(height)), found[3:, 3:]
 
 
 def pose_covariance(view: BoardView, corners: Corners, camera: Camera) -> Float[np.ndarray, "numbers numbers"]:

@@ -1,13 +1,12 @@
 """Fit a lens, the pose of every photo of a board and the waves of its sheet together: the most probable given all."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.optimize import least_squares
 
 from calibration.board.board_pose import CORNER_SIGMA, plane_poses
 from calibration.board.corners import Corners
@@ -21,8 +20,8 @@ CENTRE_TAIL = 2.0  # sigmas from which the prior of the centre gives way: some s
 ROUNDS = 8  # of reweighting; noise level and weights settle in 3 to 5
 WAVE_ROUNDS = 4  # of finding how large the waves are; the first is usually right
 STEPS = 40  # of one descent; 3 to 10 are usual
-SETTLED = 1e-6  # of chi-square: what is still to be gained is nothing, even along a narrow valley
-SAME = 1e-4  # the same after new weights: less moves nothing by more than a hundredth of its sigma
+SAME_NOISE = 1e-4  # relative: less moves nothing by more than a hundredth of its sigma
+CORNER_TAIL = 3.0  # sigmas from which a corner counts less
 SAME_SIZE = 0.1  # relative: waves found again
 EDGES_ALIKE = 10.0  # points of a blank sheet's edge: its waves are as long as several of them are apart
 RESTS_ON = 3  # corners; the lowest one alone may be an error
@@ -57,13 +56,6 @@ class Prior:
     mean: Float[np.ndarray, " lens"]
     sigma: Float[np.ndarray, " lens"]
 
-    def widened(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " lens"]:
-        """Return sigmas that let the centre go where corners clearly want it (weights of Student's t distribution)."""
-        off = (x[2:N_PINHOLE] - self.mean[2:N_PINHOLE]) / self.sigma[2:N_PINHOLE]
-        sigma = self.sigma.copy()
-        sigma[2:N_PINHOLE] *= np.sqrt(1 + (off / CENTRE_TAIL) ** 2)
-        return sigma
-
 
 @dataclass(frozen=True)
 class Solution:
@@ -71,17 +63,12 @@ class Solution:
 
     lens: Lens
     x: Float[np.ndarray, " n"]  # the lens's numbers, pose of every photo, Sheet's c
-    covariance: Float[np.ndarray, "m m"]  # of the lens's numbers and the first photo's pose, possible waves included
+    sigma: Float[np.ndarray, " lens"]  # one sigma of the lens's numbers, possible waves included
     rms: tuple[float, ...]  # per photo, px
     sheet: Sheet | None
     waves: Waves
     pose_covariances: Float[np.ndarray, "photos 6 6"]  # of each photo's pose, likewise
     noise: float  # px, one sigma per axis of a corner
-
-    @property
-    def sigma(self) -> Float[np.ndarray, " lens"]:
-        """One sigma of the lens's numbers."""
-        return np.sqrt(np.diag(self.covariance)[: self.lens.n_numbers()])
 
     def poses(self) -> Float[np.ndarray, "photos 6"]:
         """Rotation vector and translation (mm), camera from world, of every photo."""
@@ -139,38 +126,39 @@ def solve(photos: Sequence[Corners], prior: Prior, start: Solution | None = None
     """
     sheet = sheet_of(photos) if start is None else start.sheet
     rows = [np.zeros((len(photo.pixels), 0)) if sheet is None else sheet.rows(photo) for photo in photos]
-    x = _start(photos, prior, rows[0].shape[1]) if start is None else _continued(start, prior.lens)
-    problem = _Problem(photos, prior, rows, CORNER_SIGMA, [np.ones(len(row)) for row in rows], prior.sigma)
-    problem = problem.reweighted(x, float(len(x)))  # so that a photo of wrong corners does not lead the others astray
+    n_bent = rows[0].shape[1]
+    x = _start(photos, prior, n_bent) if start is None else _continued(start, prior.lens)
+    problem = _Problem(photos, prior, rows, np.zeros((n_bent, n_bent))).measured(x, float(len(x)))
     waves = FLAT if start is None else start.waves
     for _ in range(WAVE_ROUNDS):
         problem, x = _settled(problem.bent_by(sheet, waves.size, waves), x)
         before, waves = waves, FLAT if sheet is None else _weighed(problem, x, sheet)
         if abs(waves.size - before.size) <= SAME_SIZE * before.size:
             break
-    n_lens = prior.lens.n_numbers()
-    inverse = np.linalg.inv(problem.bent_by(sheet, waves.possible, waves).normal(x).square)
-    every = [problem.numbers(index) for index in range(len(photos))]
-    poses = np.array([inverse[np.ix_(own[n_lens:], own[n_lens:])] for own in every])
+    _, slopes = problem.bent_by(sheet, waves.possible, waves).weighted(x)
+    inverse, n_lens = np.linalg.inv(slopes.T @ slopes), prior.lens.n_numbers()
+    sigma, places = np.sqrt(np.diag(inverse)[:n_lens]), [problem.numbers(k)[n_lens:] for k in range(len(photos))]
+    poses = np.array([inverse[np.ix_(own, own)] for own in places])
     rms = tuple(float(np.sqrt((d**2).mean())) for d in problem.distances(x))
-    return Solution(prior.lens, x, inverse[np.ix_(every[0], every[0])], rms, sheet, waves, poses, problem.noise)
+    return Solution(prior.lens, x, sigma, rms, sheet, waves, poses, problem.noise)
 
 
 @dataclass(frozen=True)
 class _Problem:
+    """Least squares of x, in sigmas: what is believed of the lens, then of c, then how far each corner is off."""
+
     photos: Sequence[Corners]
     prior: Prior
     rows: Sequence[Float[np.ndarray, "_ k"]]  # heights of each photo's corners by c
-    noise: float  # px
-    weights: Sequence[Float[np.ndarray, " _"]]
-    sigma: Float[np.ndarray, " lens"]  # of the prior
-    stiffness: Float[np.ndarray, "k k"] | None = None  # inverse covariance of c
+    held: Float[np.ndarray, "k k"]  # c in sigmas by c: root of the inverse covariance
+    noise: float = CORNER_SIGMA  # px
 
     def bent_by(self, sheet: Sheet | None, size: float, waves: Waves) -> "_Problem":
         """Return the problem with waves of this size (mm) as prior."""
         if sheet is None:
             return self
-        return replace(self, stiffness=np.linalg.inv(sheet.shapes[waves.length]) / max(size, FLATTEST) ** 2)
+        root = np.linalg.cholesky(np.linalg.inv(sheet.shapes[waves.length])).T
+        return replace(self, held=root / max(size, FLATTEST))
 
     def ends(self) -> tuple[int, int]:
         """Return where x goes over from the lens to the poses, and from the poses to c."""
@@ -183,117 +171,87 @@ class _Problem:
         return np.append(np.arange(n_lens), n_lens + 6 * index + np.arange(6))
 
     def seen(
-        self, x: Float[np.ndarray, " n"], index: int
-    ) -> tuple[Float[np.ndarray, "corners 2"], Float[np.ndarray, "rows columns"]]:
-        """Return `see` of a photo with the heights in x."""
-        photo = self.photos[index]
-        heights = self.rows[index] @ x[self.ends()[1] :]
-        points = photo.points + np.outer(heights, [0.0, 0.0, 1.0])
-        return see(x, self.prior.lens, index, replace(photo, points=points))
+        self, x: Float[np.ndarray, " n"]
+    ) -> Iterator[tuple[Float[np.ndarray, "corners 2"], Float[np.ndarray, "rows columns"]]]:
+        """Yield `see` of each photo with the heights in x."""
+        for index, (photo, row) in enumerate(zip(self.photos, self.rows, strict=True)):
+            points = photo.points + np.outer(row @ x[self.ends()[1] :], [0.0, 0.0, 1.0])
+            yield see(x, self.prior.lens, index, replace(photo, points=points))
 
     def distances(self, x: Float[np.ndarray, " n"]) -> list[Float[np.ndarray, " _"]]:
         """Return how far each corner of each photo is off, px."""
-        return [np.linalg.norm(self.seen(x, index)[0], axis=1) for index in range(len(self.photos))]
+        return [np.linalg.norm(offsets, axis=1) for offsets, _ in self.seen(x)]
 
-    def reweighted(self, x: Float[np.ndarray, " n"], known: float) -> "_Problem":
-        """Return the problem with noise and Cauchy's weights as the residuals at x say; known: number of unknowns."""
-        distances = self.distances(x)
-        noise = _noise(np.concatenate(distances), known, self.photos[0].across is not None)
-        return replace(self, noise=noise, weights=[cauchy((d / (3 * noise)) ** 2) for d in distances])
+    def measured(self, x: Float[np.ndarray, " n"], known: float) -> "_Problem":
+        """Return the problem with the noise that the residuals at x show; known: number of unknowns."""
+        return replace(self, noise=_noise(np.concatenate(self.distances(x)), known, self.photos[0].across is not None))
 
-    def normal(self, x: Float[np.ndarray, " n"]) -> "_Normal":
-        """Return the normal equations at x."""
+    def residuals(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+        """Return what is to be small."""
         n_lens, bent = self.ends()
-        square, gradient = np.zeros((len(x), len(x))), np.zeros(len(x))
-        off = (x[:n_lens] - self.prior.mean) / self.sigma
-        cost = float(off @ off)
-        gradient[:n_lens] = off / self.sigma
-        square[range(n_lens), range(n_lens)] = self.sigma**-2.0
-        if self.stiffness is not None:
-            gradient[bent:] = self.stiffness @ x[bent:]
-            cost += float(x[bent:] @ gradient[bent:])
-            square[bent:, bent:] = self.stiffness
-        for index, (row, weight) in enumerate(zip(self.rows, self.weights, strict=True)):
-            offsets, jacobian = self.seen(x, index)
-            factor, own = np.repeat(np.sqrt(weight), 2) / self.noise, self.numbers(index)
+        of_lens = (x[:n_lens] - self.prior.mean) / self.prior.sigma
+        return np.concatenate([of_lens, self.held @ x[bent:], *(o.ravel() / self.noise for o, _ in self.seen(x))])
+
+    def jacobian(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "m n"]:
+        """Return the derivatives of the residuals."""
+        n_lens, bent = self.ends()
+        by_x = [np.diag(1 / self.prior.sigma), np.zeros((n_lens, len(x) - n_lens))]
+        blocks = [np.hstack(by_x), np.hstack([np.zeros((len(x) - bent, bent)), self.held])]
+        for index, (row, (_, slopes)) in enumerate(zip(self.rows, self.seen(x), strict=True)):
+            own, block = self.numbers(index), np.zeros((2 * len(row), len(x)))
             up = np.asarray(cv2.Rodrigues(x[own[n_lens:][:3]])[0])[:, 2]
-            by_c = (jacobian[:, -3:] @ up)[:, None] * np.repeat(row, 2, axis=0)
-            own = np.append(own, np.arange(bent, len(x)))
-            values, jacobian = offsets.ravel() * factor, np.hstack([jacobian, by_c]) * factor[:, None]
-            square[np.ix_(own, own)] += jacobian.T @ jacobian
-            gradient[own] += jacobian.T @ values
-            cost += float(values @ values)
-        return _Normal(cost, square, gradient)
+            block[:, own] = slopes / self.noise
+            block[:, bent:] = (block[:, own[-3:]] @ up)[:, None] * np.repeat(row, 2, axis=0)
+            blocks.append(block)
+        return np.vstack(blocks)
 
+    def loss(self, squares: Float[np.ndarray, " m"]) -> Float[np.ndarray, "3 m"]:
+        """Return Cauchy's loss of corners, by their distance, and of the lens's centre, as least_squares takes it.
 
-class _Normal(NamedTuple):
-    """Gauss and Newton's quadratic of the sum of squared residuals (in sigmas)."""
-
-    cost: float
-    square: Float[np.ndarray, "n n"]  # half the second derivatives
-    gradient: Float[np.ndarray, " n"]  # half the first derivatives
-
-    def step(self, damping: float) -> tuple[Float[np.ndarray, " n"], float]:
-        """Return Levenberg and Marquardt's step of x, and by how much it would lower the cost of the quadratic.
-
-        Raises:
-            LinAlgError: no step at this damping.
+        The second derivative is left out (iteratively reweighted least squares).
         """
-        damped = damping * np.diag(self.square)
-        step = -cho_solve(cho_factor(self.square + np.diag(damped)), self.gradient)
-        return step, float(damped @ step**2 - self.gradient @ step)
+        centre, told = slice(2, N_PINHOLE), self.prior.lens.n_numbers() + len(self.held)
+        losses, weights = squares.copy(), np.ones_like(squares)
+        aside = squares[centre] / CENTRE_TAIL**2
+        losses[centre], weights[centre] = CENTRE_TAIL**2 * np.log1p(aside), cauchy(aside)
+        apart = squares[told:].reshape(-1, 2).sum(1) / CORNER_TAIL**2
+        losses[told:] = np.repeat(CORNER_TAIL**2 * np.log1p(apart) / 2, 2)  # a half for each coordinate
+        weights[told:] = np.repeat(cauchy(apart), 2)
+        return np.stack([losses, weights, np.zeros_like(squares)])
+
+    def weighted(self, x: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
+        """Return residuals and derivatives with the roots of their weights."""
+        off = self.residuals(x)
+        root = np.sqrt(self.loss(off**2)[1])
+        return off * root, self.jacobian(x) * root[:, None]
 
 
 def _settled(problem: _Problem, x: Float[np.ndarray, " n"]) -> tuple[_Problem, Float[np.ndarray, " n"]]:
-    """Return the optimum, with noise and weights that belong to it."""
+    """Return the optimum, with the noise that belongs to it."""
     bent = problem.ends()[1]
     for _ in range(ROUNDS):
-        before = problem.normal(x).cost
-        x, normal = _descended(problem, x)
-        known = float(bent)
-        if problem.stiffness is not None:  # c, as far as it is not held by its prior
-            spread = np.linalg.inv(normal.square)[bent:, bent:]
-            known += len(spread) - float((spread * problem.stiffness).sum())
-        problem = replace(problem.reweighted(x, known), sigma=problem.prior.widened(x))
-        if before - normal.cost < SAME:
+        x = least_squares(problem.residuals, x, problem.jacobian, x_scale="jac", loss=problem.loss, max_nfev=STEPS).x
+        _, slopes = problem.weighted(x)
+        root = np.linalg.qr(slopes, mode="r")[bent:, bent:]
+        free = len(root) - float(np.square(np.linalg.solve(root.T, problem.held.T)).sum())  # c, where not held
+        before, problem = problem.noise, problem.measured(x, bent + free)
+        if abs(problem.noise - before) <= SAME_NOISE * before:
             break
     return problem, x
 
 
-def _descended(problem: _Problem, x: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], _Normal]:
-    """Return the nearest optimum and its normal equations (Levenberg and Marquardt; damping by Nielsen 1999)."""
-    normal, damping, growth = problem.normal(x), 1e-7, 2.0
-    for _ in range(STEPS):
-        try:
-            step, expected = normal.step(damping)
-        except LinAlgError:
-            damping, growth = damping * growth, 2 * growth
-            continue
-        tried = problem.normal(x + step)
-        gain = normal.cost - tried.cost
-        if gain > 0:
-            x, normal = x + step, tried
-            damping *= max(1 / 3, 1 - (2 * gain / expected - 1) ** 3)
-            growth = 2.0
-        else:  # also where it is no number
-            damping, growth = damping * growth, 2 * growth
-        if min(abs(gain), expected) < SETTLED:
-            break
-    return x, normal
-
-
 def _weighed(problem: _Problem, x: Float[np.ndarray, " n"], sheet: Sheet) -> Waves:
     """Return the waves that the residuals ask for."""
-    bent = problem.ends()[1]
-    cost, square, gradient = replace(problem, stiffness=None).normal(x)
-    c, mixed = x[bent:], square[:bent, bent:]
-    fitted = np.linalg.solve(square[:bent, :bent], np.column_stack([gradient[:bent], mixed]))  # all else to each c
-    reduced = gradient[bent:] - mixed.T @ fitted[:, 0]
-    curvature = square[bent:, bent:] - mixed.T @ fitted[:, 1:]
-    cost += c @ curvature @ c - 2 * reduced @ c - gradient[:bent] @ fitted[:, 0]  # at c = 0, the flat sheet
-    n = 2 * sum(float(weight.sum()) for weight in problem.weights) - bent
+    n_lens, bent = problem.ends()
+    off, slopes = problem.weighted(x)
+    weights = problem.loss(problem.residuals(x) ** 2)[1][n_lens + len(problem.held) :]
+    off, slopes = (np.delete(one, np.s_[n_lens : n_lens + len(problem.held)], axis=0) for one in (off, slopes))
+    at_flat = np.column_stack([slopes, off - slopes[:, bent:] @ x[bent:]])
+    reduced = np.linalg.qr(at_flat, mode="r")[bent:, bent:]  # all else fitted to each c
+    by_c, flat = reduced[:, :-1], reduced[:, -1]
+    n = max(float(weights.sum()) - bent, 1.0)
     finest = FINEST_NOISE / problem.noise
-    return weigh_waves(sheet, reduced - curvature @ c, curvature, float(cost), max(n, 1.0), finest)
+    return weigh_waves(sheet, by_c.T @ flat, by_c.T @ by_c, float(flat @ flat), n, finest)
 
 
 def _noise(distances: Float[np.ndarray, " n"], n_unknowns: float, are_edges: bool) -> float:

@@ -12,7 +12,7 @@ from calibration.board.board import AnyBoard, Blank, Board, opencv_dictionary
 from calibration.board.lattice import find_lattices, flat_view
 from calibration.board.placement import place, placed_markers
 from calibration.board.sheet_edges import find_edges
-from capture.checks.robust import cauchy
+from capture.checks.robust import cauchy, reweighted_fit
 from capture.photos.photo import Photo, encode_srgb, read_photo, smaller
 
 Grey = UInt8[np.ndarray, "_ _"]  # height, width; a reduced copy may stand beside the photo in one signature
@@ -34,6 +34,7 @@ NEWTON_STEPS = 5  # to the saddle point; the last moves it by less than 0.001 px
 FARTHEST_SADDLE = 0.5  # half windows between the corner and its saddle point: beyond, it belongs to something else
 SMOOTH_FROM = {3: 20, 2: 12}  # fewest corners for a cubic, a quadratic to separate lens distortion from wrong corners
 STRAY = {3: 0.06, 2: 0.08, 0: 0.25}  # of the spacing: how far a corner may be off that, and off no model of distortion
+SMOOTH_ROUNDS = 10  # of reweighting
 MOST_PHOTOS = 8  # evenly chosen: each is read whole, and more change the median little
 FEWEST_ALIKE = 3  # photos, whose median leaves out what one of them hides
 
@@ -50,10 +51,6 @@ class Corners:
     board: AnyBoard  # as matched: columns and rows may be exchanged against the request
     is_placed: bool = True  # False: seen in part, and numbered from some corner; the plane is right, its origin is not
     across: Float[np.ndarray, "n 2"] | None = None  # unit vectors, px: points of edges were measured along these only
-
-    def __post_init__(self):
-        if len(self.pixels) != len(self.points):
-            raise ValueError("corners need one point per pixel")
 
     def part(self, chosen: slice) -> "Corners":
         """Return some of the corners."""
@@ -262,15 +259,13 @@ def _smooth(values: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], d
     """
     x, y = ((plane - plane.mean(0)) / plane.std(0).max()).T
     terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], 1)
-    stiff, rest = np.eye(terms.shape[1]) * STRAY[degree], np.zeros((terms.shape[1], 2))
-    fitted = np.zeros_like(values)
-    for _ in range(10):
-        distance = np.linalg.norm(values - fitted, axis=1)  # at first from the flat view, which no stray corner bends
-        root = np.sqrt(cauchy((distance / max(2 * np.median(distance), 1e-6)) ** 2))[:, None]
-        fitted = (
-            terms @ np.linalg.lstsq(np.vstack([terms * root, stiff]), np.vstack([values * root, rest]), rcond=None)[0]
-        )
-    return fitted
+
+    def weigh(off: Float[np.ndarray, "2 n"]) -> Float[np.ndarray, " n"]:
+        distance = np.linalg.norm(off, axis=0)  # at first from the flat view, which no stray corner bends
+        return cauchy((distance / max(2 * np.median(distance), 1e-6)) ** 2)
+
+    start = np.zeros(values.T.shape)
+    return terms @ reweighted_fit(terms, values.T, weigh, SMOOTH_ROUNDS, start, STRAY[degree] ** 2).T
 
 
 def under_the_flashlight(lit: Sequence[Path], board: AnyBoard) -> tuple[Grey, float | None, Corners] | None:

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from calibration.board.board import Board, opencv_dictionary
-from calibration.board.lattice import Lattice
-from calibration.board.saddles import brightness
+from calibration.board.lattice import Lattice, brightness
 
 FRINGE, FRINGE_SHARE = 3, 1 / 3  # corners: an outer row with fewer than both belongs to something beside the board
 PART_OF_BOARD = 0.5  # of the corners: less of an unplaced checkerboard may be a tablecloth

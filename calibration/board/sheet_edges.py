@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from scipy import ndimage
 
 from calibration.board.board import Blank
-from capture.checks.robust import cauchy
+from capture.checks.robust import cauchy, reweighted_fit
 from capture.decode.exif import ORDINARY_FOCAL_35MM, focal_in_pixels
 from capture.photos.photo import decode_srgb, smaller
 
@@ -211,18 +211,10 @@ def _lines(
     offsets: Float[np.ndarray, "n places"], shares: Float[np.ndarray, " places"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Bool[np.ndarray, "n places"]]:
     """Fit a line to each row (weights of Cauchy's loss); return its level, its slope and which places agree."""
-    level, slant = np.median(offsets, axis=1), np.zeros(len(offsets))
-    off = offsets - level[:, None]
-    for _ in range(LINE_ROUNDS):
-        weight = cauchy((off / OFF_LINE_PX) ** 2)
-        total, first, second = (weight * shares**k for k in range(3))
-        moments = [part.sum(1) for part in (total, first, second)]
-        values = (weight * offsets).sum(1), (weight * shares * offsets).sum(1)
-        determinant = moments[0] * moments[2] - moments[1] ** 2
-        level = (moments[2] * values[0] - moments[1] * values[1]) / determinant
-        slant = (moments[0] * values[1] - moments[1] * values[0]) / determinant
-        off = offsets - level[:, None] - slant[:, None] * shares
-    return level, slant, np.abs(off) < OFF_LINE_PX
+    basis = np.stack([np.ones_like(shares), shares], 1)
+    start = np.broadcast_to(np.median(offsets, axis=1, keepdims=True), offsets.shape)
+    lines = reweighted_fit(basis, offsets, lambda off: cauchy((off / OFF_LINE_PX) ** 2), LINE_ROUNDS, start)
+    return lines[:, 0], lines[:, 1], np.abs(offsets - lines @ basis.T) < OFF_LINE_PX
 
 
 def _is_enough(seen: Bool[np.ndarray, " n"], blank: Blank) -> bool:

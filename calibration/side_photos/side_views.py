@@ -15,17 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.board.board import Board
-from calibration.board.board_pose import (
-    CLEAR_WIN,
-    CORNER_SIGMA,
-    SAME_LENS,
-    WORST_MISFIT,
-    board_views,
-    pose_covariance,
-    reprojected,
-    unexplained,
-)
-from calibration.board.corners import FEWEST_CORNERS, Corners, find_board, grey_of
+from calibration.board.board_pose import SAME_LENS, best_view, pose_covariance, reprojected
+from calibration.board.corners import Corners, find_board, grey_of
 from calibration.ground.ground_field import fit_ground_field
 from calibration.ground.ground_shadows import find_shadows
 from calibration.ground.shadow_reach import NEAREST, most_height
@@ -35,6 +26,7 @@ from calibration.posed_camera import PosedCamera
 from calibration.side_photos.ground_look import TripodView, stood_there
 from calibration.side_photos.silhouette import find_silhouette, possible_region, share_shown
 from calibration.side_view import SideView
+from capture.errors import CalibrationError
 from capture.photos.photo import Photo, PhotoStack, read_photo
 from capture.session.session import Session
 
@@ -60,21 +52,12 @@ def side_pose(
         about: world points of the object, where the pose must be well known.
     """
     camera = tripod.camera
-    if len(corners.pixels) < FEWEST_CORNERS or not corners.is_placed:
-        return (
-            f"{len(corners.pixels)} corners of the board are seen, {FEWEST_CORNERS} that tell its place are needed. "
-            "Keep object and board in view"
-        )
-    views = board_views(corners, camera, is_refocused=True)
-    if not views:
-        return unexplained(corners, camera)
-    best, limit = views[0], WORST_MISFIT * max(camera.width, camera.height)
-    if best.rms() > limit:
-        return (
-            f"the board's corners are {best.rms():.1f} px off, at most {limit:.1f} px expected: is the photo blurred?"
-        )
-    if len(views) > 1 and (views[1].cost - best.cost) / max(CORNER_SIGMA, best.rms()) ** 2 < CLEAR_WIN:
-        return "the board is seen too small or too steeply from above to tell the camera's place. Come nearer and lower"
+    if not corners.is_placed:
+        return "a part of the board is seen that does not tell its place. Keep object and board in view"
+    try:
+        best = best_view(corners, camera, is_refocused=True)
+    except CalibrationError as error:
+        return str(error).rstrip(".")
     zoom = float(np.exp(best.numbers[6]))
     found = replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
     by_place = reprojected(best.numbers, Corners(np.zeros((len(about), 2)), about, corners.board), camera)[1][:, :7]

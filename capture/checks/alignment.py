@@ -1,4 +1,4 @@
-"""CommonView: photos of one fixed view as textures, and the shift of each photo against a group of them.
+"""Alignment: photos of one fixed view as textures, and the shift of each photo against a group of them.
 
 Every photo is compared with the fine texture that the group has in common (capture.checks.registration). That texture
 is taken from the half of the group that does not contain the photo; otherwise the photo's own noise, which never moves,
@@ -22,7 +22,6 @@ from capture.checks.registration import (
     Correlator,
     Plane,
     Points,
-    Rotation,
     Shift,
     is_lit,
     middle_of,
@@ -30,7 +29,7 @@ from capture.checks.registration import (
     sigma_along,
     texture_of,
 )
-from capture.photos.channels import mean_of_channels
+from capture.photos.channels import in_blocks, mean_of_channels
 from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
 
@@ -47,60 +46,47 @@ BOARD_SHOWS = 0.1  # of the cells have to show the photos' texture: boards left 
 MOVED, BOARD_OFF = "camera moved", "camera moved from board"  # kinds of finding
 BOARD_PX = 3.0  # at common_view.REFERENCE_PX: about 0.2 degrees of a phone's view, which the ground's slope may be off
 BOARD_SIGMAS = 5.0  # of the shift as well; another focus than the photos' makes it uncertain
-TRIES = 2  # with the cells that agree; those of the second are chosen where the first one led
 
 
 @dataclass(frozen=True)
-class CommonView:
-    """The photos as textures, each moved to where the group is, and what each half of the group has in common."""
+class Alignment:
+    """The photos as textures, compared with what each half of a group of them has in common."""
 
-    textures: list[Plane]
+    seen: list[Plane]  # textures as photographed
+    textures: list[Plane]  # moved to where the group is
     brightness: list[Plane]
     halves: tuple[Plane, Plane]
     others: list[int]  # the half that each photo is compared with
+    points: Points  # of the halves, with which shifts were refined
+    shifts: Float[np.ndarray, "photos 2"]  # px of the stack, u and v; NaN where nothing tells
+    covariances: Float[np.ndarray, "photos 2 2"]  # of each shift, px^2; NaN likewise
 
     def common(self, photo: int) -> Plane:
         """The texture that a photo is compared with."""
         return self.halves[self.others[photo]]
 
-    @property
-    def cell_side(self) -> int:
-        """Length of a cell's side, px."""
-        return max(max(self.halves[0].shape) // CELLS_ALONG, 1)
-
-    def in_cells(self, values: Plane) -> Float[np.ndarray, "rows columns"]:
-        """The mean of each cell."""
-        side = self.cell_side
-        rows, columns = values.shape[0] // side, values.shape[1] // side
-        return values[: rows * side, : columns * side].reshape(rows, side, columns, side).mean((1, 3))
+    def outside(self) -> Bool[np.ndarray, " photos"]:
+        """The photos that may lie off the group: their shift is unlike that of any good photo, or was not found."""
+        return ~(np.hypot(*self.shifts.T) <= allowed_px(self.halves[0]))
 
     def slopes(self, texture: Plane, common: Plane) -> Float[np.ndarray, "rows columns"]:
         """How much of the common texture each cell of another one shows."""
-        return self.in_cells(texture * common) / (self.in_cells(common * common) + np.finfo(float).tiny)
+        return in_cells(texture * common) / (in_cells(common * common) + np.finfo(float).tiny)
 
     def lit_cells(self, photo: int) -> Bool[np.ndarray, "rows columns"]:
         """Cells that the photo's light reaches everywhere."""
-        return self.in_cells(is_lit(self.brightness[photo]).astype(np.float32)) == 1
-
-
-@dataclass(frozen=True)
-class Alignment:
-    """Shifts of photos against a group of them."""
-
-    shifts: Float[np.ndarray, "photos 2"]  # px of the stack, u and v; NaN where nothing tells
-    covariances: Float[np.ndarray, "photos 2 2"]  # of each shift, px^2; NaN likewise
-    view: CommonView
-    points: Points  # of the halves, with which shifts were refined
-
-    def outside(self) -> Bool[np.ndarray, " photos"]:
-        """The photos that may lie off the group: their shift is unlike that of any good photo, or was not found."""
-        return ~(np.hypot(*self.shifts.T) <= allowed_px(self.view.halves[0]))
+        return in_cells(is_lit(self.brightness[photo]).astype(np.float32)) == 1
 
 
 def textures_of(stack: PhotoStack, indices: Sequence[int]) -> tuple[list[Plane], list[Plane]]:
     """Texture and brightness, over saturation, of some photos."""
     brightness = [mean_of_channels(stack.rgb[i]) * stack.gains[i] for i in indices]
     return [texture_of(stack.rgb[i]) for i in indices], brightness
+
+
+def in_cells(values: Plane) -> Float[np.ndarray, "rows columns"]:
+    """The mean of each cell."""
+    return in_blocks(values, max(max(values.shape) // CELLS_ALONG, 1)).mean((2, 3))
 
 
 def allowed_px(picture: Plane) -> float:
@@ -137,7 +123,7 @@ def align(textures: list[Plane], brightness: list[Plane], among: Int[np.ndarray,
             break
         shifts, group = shifts - middle, near
     still = [moved_back(t, s) if np.hypot(*s) > STILL_PX else t for t, s in zip(textures, shifts, strict=True)]
-    return Alignment(shifts, covariances, CommonView(still, brightness, halves, others), points)
+    return Alignment(textures, still, brightness, halves, others, points, shifts, covariances)
 
 
 def _coarse_shifts(textures: list[Plane], correlator: Correlator) -> Float[np.ndarray, "photos 2"]:
@@ -175,7 +161,6 @@ def densest(
 class HomeView:
     """The photos compared with the chosen group, and the photo of the board compared with it."""
 
-    textures: list[Plane]  # as photographed
     alignment: Alignment
     board: Path | None  # the photo of the board, where there is one of the photos' size
     shift: Shift  # of the photo of the board, px of the stack; NaN where nothing tells
@@ -190,7 +175,7 @@ class HomeView:
     @property
     def members(self) -> Int[np.ndarray, " members"]:
         """Places of the photos that tell what is usual: all, unless the board belongs to some of them only."""
-        return np.flatnonzero(~self.alignment.outside()) if self.pushed else np.arange(len(self.textures))
+        return np.flatnonzero(~self.alignment.outside()) if self.pushed else np.arange(len(self.alignment.seen))
 
     def fault(self, photo: Path) -> tuple[str, str]:
         """Return the kind of finding for a photo that lies off the group, and a name for the reference."""
@@ -209,34 +194,33 @@ def home_view(stack: PhotoStack, indices: Sequence[int], board: PhotoStack | Non
     textures, brightness = textures_of(stack, indices)
     largest = align(textures, brightness, np.arange(len(textures)))
     if board is None or board.rgb.shape[1:] != stack.rgb.shape[1:]:
-        return HomeView(textures, largest, None, np.full(2, np.nan), np.nan)
+        return HomeView(largest, None, np.full(2, np.nan), np.nan)
     correlator = Correlator.over(textures)
     texture, lit = (planes[0] for planes in textures_of(board, [0]))
-    shift, sigma = shift_of_board(texture, lit, largest.view, correlator)
+    shift, sigma = shift_of_board(texture, lit, largest, correlator)
     limit, path = allowed_px(texture), board.paths[0]
     rest = np.flatnonzero(largest.outside())
     if not np.hypot(*shift) <= limit and len(rest) >= FEWEST_PHOTOS:
         other = align(textures, brightness, rest)
-        off, its_sigma = shift_of_board(texture, lit, other.view, correlator)
+        off, its_sigma = shift_of_board(texture, lit, other, correlator)
         if np.hypot(*off) <= limit and (~other.outside()[rest]).sum() >= FEWEST_PHOTOS:
             pushed = frozenset(np.flatnonzero(~largest.outside()).tolist())
-            return HomeView(textures, other, path, off, its_sigma, pushed)
-    return HomeView(textures, largest, path, shift, sigma)
+            return HomeView(other, path, off, its_sigma, pushed)
+    return HomeView(largest, path, shift, sigma)
 
 
 def board_findings(stack: PhotoStack, indices: Sequence[int], home: HomeView) -> list[Finding]:
     """Return a finding for each photo if the board's photo lies off every group that could be kept."""
     length = float(np.hypot(*home.shift))
-    limit = max(allowed_px(home.textures[0]) * BOARD_PX / MOVED_PX, BOARD_SIGMAS * home.sigma)
+    limit = max(allowed_px(home.alignment.seen[0]) * BOARD_PX / MOVED_PX, BOARD_SIGMAS * home.sigma)
     if home.board is None or not length > limit:
         return []
-    to_file = stack.full_width / stack.rgb.shape[2]
-    found = []
+    length, limit, found = length * stack.to_file, limit * stack.to_file, []
     for k in home.members.tolist():
         path = stack.paths[indices[k]]
-        text = f"the view lies {length * to_file:.1f} px off that of {named_apart(home.board, path)}, the photo of the "
-        text += f"board, at most {limit * to_file:.1f} px is fine: did the tripod move in between?"
-        found.append(Finding(path, BOARD_OFF, text, length * to_file, limit * to_file, False))
+        text = f"the view lies {length:.1f} px off that of {named_apart(home.board, path)}, the photo of the board, "
+        text += f"at most {limit:.1f} px is fine: did the tripod move in between?"
+        found.append(Finding(path, BOARD_OFF, text, length, limit, False))
     return found
 
 
@@ -245,50 +229,17 @@ def named_apart(board: Path, photo: Path) -> str:
     return board.name if board.parent == photo.parent else f"{board.parent.name}/{board.name}"
 
 
-def shift_of_board(texture: Plane, brightness: Plane, view: CommonView, correlator: Correlator) -> tuple[Shift, float]:
-    """Return the shift of the board's photo against a group, px, and one sigma; NaN if too little is shared.
-
-    Only cells that agree with the photos take part: the board itself covers some, and the object others.
-    """
+def shift_of_board(texture: Plane, brightness: Plane, view: Alignment, correlator: Correlator) -> tuple[Shift, float]:
+    """Return the shift of the board's photo against a group, px, and one sigma; NaN if too little is shared."""
     starts = [np.zeros(2), *(correlator.shift(correlator.spectra(texture), correlator.spectra(h)) for h in view.halves)]
-    agreeing = [(_agreeing(texture, start, view), start) for start in starts if np.isfinite(start).all()]
-    agrees, shift = max(agreeing, key=lambda pair: int(pair[0].sum()))
-    points, covariance = Points.of(view.halves), np.full((2, 2), np.nan)
-    for _ in range(TRIES):
-        if agrees.mean() < BOARD_SHOWS:
-            return np.full(2, np.nan), np.nan
-        shift, covariance = points.refined(texture, _only(brightness, agrees, view.cell_side), 0, shift)
-        if not np.isfinite(shift).all():
-            return shift, np.nan
-        agrees = _agreeing(texture, shift, view)
-    is_clear = agrees.mean() >= BOARD_SHOWS
+    start = max((one for one in starts if np.isfinite(one).all()), key=lambda one: _agreeing(texture, one, view))
+    shift, covariance = view.points.refined(texture, brightness, 0, start)
+    is_clear = np.isfinite(shift).all() and _agreeing(texture, shift, view) >= BOARD_SHOWS
     return (shift, sigma_along(covariance, shift)) if is_clear else (np.full(2, np.nan), np.nan)
 
 
-def board_rotation(board: PhotoStack, home: HomeView, rotation: Rotation) -> Float[np.ndarray, "3"]:
-    """Return the rotation of the camera from the group to the photo of the board; NaN if too little is shared.
-
-    Args:
-        rotation: the meaning of the three angles.
-    """
-    texture, brightness = (planes[0] for planes in textures_of(board, [0]))
-    view, points = home.alignment.view, home.alignment.points
-    if not np.isfinite(home.shift).all():
-        return np.full(3, np.nan)
-    lit = _only(brightness, _agreeing(texture, home.shift, view), view.cell_side)
-    return points.refined(texture, lit, 0, rotation.from_shift(home.shift), rotation.homography)[0]
-
-
-def _agreeing(texture: Plane, shift: Shift, view: CommonView) -> Bool[np.ndarray, "rows columns"]:
-    """Cells in which a photo, moved back, correlates with what both halves have in common."""
+def _agreeing(texture: Plane, shift: Shift, view: Alignment) -> float:
+    """The share of cells in which a photo, moved back, correlates with what both halves have in common."""
     seen, common = moved_back(texture, shift), 0.5 * (view.halves[0] + view.halves[1])
-    strength = view.in_cells(seen * seen) * view.in_cells(common * common)
-    return view.in_cells(seen * common) > SHOWN * np.sqrt(strength)
-
-
-def _only(brightness: Plane, cells: Bool[np.ndarray, "rows columns"], side: int) -> Plane:
-    """The brightness, 0 outside some cells."""
-    kept = np.zeros_like(brightness)
-    rows, columns = (side * n for n in cells.shape)
-    kept[:rows, :columns] = brightness[:rows, :columns] * cells.repeat(side, 0).repeat(side, 1)
-    return kept
+    strength = in_cells(seen * seen) * in_cells(common * common)
+    return float((in_cells(seen * common) > SHOWN * np.sqrt(strength)).mean())

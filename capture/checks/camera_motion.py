@@ -16,12 +16,13 @@ from jaxtyping import Bool, Float, Int
 from capture.checks.alignment import (
     FEWEST_PHOTOS,
     SHOWN,
-    CommonView,
+    Alignment,
     HomeView,
     allowed_px,
     board_findings,
     densest,
     home_view,
+    in_cells,
 )
 from capture.checks.registration import is_lit, moved_back
 from capture.checks.robust import column_quantile, column_spread
@@ -104,7 +105,7 @@ def view_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack |
         board: the tripod's photo of the board, whose camera is the calibrated one.
     """
     home = home_view(stack, indices, board)
-    view = home.alignment.view
+    view = home.alignment
     shown, steady = _cells(view, home.members)
     low = _low_contrast(_contrasts(view))
     known = [one[steady & np.isfinite(one)] for one in shown]
@@ -143,13 +144,13 @@ def _moved_photos(
     place. Photos beside and after a moved one that lie nearer to the place of several moved ones than to their expected
     place therefore count as moved, even if their own shift alone is not significant.
     """
-    far = np.flatnonzero(home.lengths > allowed_px(home.textures[0])).tolist()
+    far = np.flatnonzero(home.lengths > allowed_px(home.alignment.seen[0])).tolist()
     differing = {k for k in far if is_same[k] and _is_explained(home, k, steady)}
     limits = _motion_limits(home, differing)
     moved = {k for k in far if is_same[k] and (k in home.pushed or k in differing) and home.lengths[k] > limits[k]}
     if len(moved) < FEWEST_ALIKE:
         return moved, limits
-    shifts, radius = home.alignment.shifts, allowed_px(home.textures[0]) / 2
+    shifts, radius = home.alignment.shifts, allowed_px(home.alignment.seen[0]) / 2
     middle, near = densest(shifts[sorted(moved)], radius)
     if near.sum() < FEWEST_ALIKE:
         return moved, limits
@@ -177,7 +178,7 @@ def _motion_limits(home: HomeView, differing: set[int]) -> Float[np.ndarray, " p
     own = np.einsum("iw,pij,jw->pw", ways, np.nan_to_num(home.alignment.covariances), ways)
     sigmas = np.sqrt(np.maximum(own, 0) + np.square(between)) + np.finfo(float).tiny
     most = (np.abs(np.nan_to_num(home.alignment.shifts) @ ways) / sigmas).max(1)
-    return np.maximum(allowed_px(home.textures[0]), MOVED_SIGMAS * home.lengths / np.maximum(most, 1e-9))
+    return np.maximum(allowed_px(home.alignment.seen[0]), MOVED_SIGMAS * home.lengths / np.maximum(most, 1e-9))
 
 
 def _is_explained(home: HomeView, photo: int, steady: Bool[np.ndarray, "rows columns"]) -> bool:
@@ -186,21 +187,20 @@ def _is_explained(home: HomeView, photo: int, steady: Bool[np.ndarray, "rows col
     Asked of each cell, of those that the shift would change most: shading and the edges of shadows differ by more than
     half a pixel of motion does, but only in some cells, and what light makes seem a shift goes with it in few.
     """
-    view, seen = home.alignment.view, home.textures[photo]
+    view, seen = home.alignment, home.alignment.seen[photo]
     asked, common = steady & view.lit_cells(photo), view.common(photo)
     if not asked.any():
         return False
     change = moved_back(common, -home.alignment.shifts[photo]) - common
-    alike, strength = (view.in_cells(change * other)[asked] for other in (seen - common, change))
+    alike, strength = (in_cells(change * other)[asked] for other in (seen - common, change))
     strong = strength >= np.median(strength)
     return float(np.median(alike[strong] / (strength[strong] + np.finfo(float).tiny))) > AS_MOVED
 
 
 def _moved(stack: PhotoStack, path: Path, length: float, limit: float, kind: str, whom: str) -> Finding:
-    to_file = stack.full_width / stack.rgb.shape[2]
-    text = f"the view lies {length * to_file:.1f} px off {whom}, at most {limit * to_file:.1f} px is fine: "
-    text += "did the tripod move?"
-    return Finding(path, kind, text, length * to_file, limit * to_file, True)
+    length, limit = length * stack.to_file, limit * stack.to_file
+    text = f"the view lies {length:.1f} px off {whom}, at most {limit:.1f} px is fine: did the tripod move?"
+    return Finding(path, kind, text, length, limit, True)
 
 
 def _blurred_or_another(path: Path, contrast: float, limit: float, own: float) -> Finding:
@@ -245,7 +245,7 @@ def _spread(values: Float[np.ndarray, "photos columns"]) -> Float[np.ndarray, " 
     return column_spread(values - np.nanmedian(values, 0))
 
 
-def _contrasts(view: CommonView) -> Float[np.ndarray, "photos axes"]:
+def _contrasts(view: Alignment) -> Float[np.ndarray, "photos axes"]:
     """Slope of each photo's texture over that of the other half, from one pixel to the next: down, and to the right.
 
     Shake along one axis leaves the texture of the other. NaN where the halves do not agree on any texture, or where too
@@ -268,7 +268,7 @@ def _contrasts(view: CommonView) -> Float[np.ndarray, "photos axes"]:
 
 
 def _cells(
-    view: CommonView, members: Int[np.ndarray, " members"]
+    view: Alignment, members: Int[np.ndarray, " members"]
 ) -> tuple[Float[np.ndarray, "photos rows columns"], Bool[np.ndarray, "rows columns"]]:
     """How much of the common texture each cell of each photo shows (NaN: not lit), and where nearly all members do."""
     first, second = view.halves
@@ -285,7 +285,7 @@ def _cells(
 
 
 def _hidden_share(
-    view: CommonView, photo: int, shown: Float[np.ndarray, "rows columns"], steady: Bool[np.ndarray, "rows columns"]
+    view: Alignment, photo: int, shown: Float[np.ndarray, "rows columns"], steady: Bool[np.ndarray, "rows columns"]
 ) -> float:
     """The share of the picture in the largest piece where a photo lacks what nearly all others show, highlights apart.
 
@@ -293,8 +293,8 @@ def _hidden_share(
     """
     hidden = (shown < MISSING) & steady
     count, pieces = cv2.connectedComponents(hidden.astype(np.uint8), connectivity=4)
-    own, brightness = view.in_cells(view.textures[photo] ** 2), view.in_cells(view.brightness[photo])
-    usual = float(np.median(view.in_cells(view.common(photo) ** 2)[steady])) if steady.any() else 0.0
+    own, brightness = in_cells(view.textures[photo] ** 2), in_cells(view.brightness[photo])
+    usual = float(np.median(in_cells(view.common(photo) ** 2)[steady])) if steady.any() else 0.0
     largest = 0
     for number in range(1, count):
         piece = (pieces == number).astype(np.uint8)
@@ -307,8 +307,8 @@ def _hidden_share(
     return largest / hidden.size
 
 
-def _own_strength(view: CommonView, photo: int) -> float:
+def _own_strength(view: Alignment, photo: int) -> float:
     """Strength of a photo's own texture over the common one, wherever it lies; cells that are not lit do not count."""
     lit = view.lit_cells(photo)
-    ratio = view.in_cells(view.textures[photo] ** 2) / (view.in_cells(view.common(photo) ** 2) + 1e-12)
+    ratio = in_cells(view.textures[photo] ** 2) / (in_cells(view.common(photo) ** 2) + 1e-12)
     return float(np.sqrt(np.median(ratio[lit]))) if lit.any() else 1.0

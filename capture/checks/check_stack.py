@@ -23,8 +23,8 @@ from capture.checks.alignment import (
     REFERENCE_PX,
     HomeView,
     allowed_px,
-    board_rotation,
     home_view,
+    textures_of,
 )
 from capture.checks.ambient_light import shadow_findings
 from capture.checks.camera_motion import view_findings
@@ -67,8 +67,7 @@ def check_stack(
         found += view_findings(stack, indices, board)
         left_out = {finding.photo for finding in found if finding.drop}
         found += shadow_findings(stack, [path not in left_out for path in stack.paths], dark)
-    order = {path: i for i, path in enumerate(stack.paths)}
-    return tuple(sorted(found, key=lambda finding: order[finding.photo]))
+    return _in_order(stack, found)
 
 
 def white_balance_finding(photo: Path, ratio: float) -> Finding:
@@ -144,7 +143,7 @@ def check_and_register(
     for i, path in enumerate(stack.paths):
         motion = own.get(i, np.eye(3)) @ (np.eye(3) if to_board is None else np.linalg.inv(to_board))
         if path not in off | dropped and (length := _shift_of(motion, stack)) > NEAR_ENOUGH:
-            length *= stack.full_width / stack.rgb.shape[2]
+            length *= stack.to_file
             text = (
                 f"the view lay {length:.1f} px off, as after a tap on the phone; the photo was moved back and is used"
             )
@@ -209,23 +208,18 @@ def _motions(
     height, width = stack.rgb.shape[1:3]
     home = home_view(stack, indices, board)
     rotation = Rotation(focal_in_pixels(stack.focal_35mm, width, height), width, height)
-    turns = {i: _own_angles(home, k, rotation) for k, i in enumerate(indices) if stack.paths[i] in off}
+    view, turns = home.alignment, {}
+    for k, i in enumerate(indices):
+        if stack.paths[i] in off:
+            pair, start = (view.seen[k], view.brightness[k]), rotation.from_shift(view.shifts[k])
+            turns[i], _ = view.points.refined(*pair, view.others[k], start, rotation.homography)
     own = {i: rotation.homography(one) for i, one in _shared(turns, rotation.focal, home).items()}
     own = {i: motion for i, motion in own.items() if _shift_of(motion, stack) <= farthest}
     if board is None or len(near) == len(off):
         return own, None
-    angles = board_rotation(board, home, rotation)
+    pair = (planes[0] for planes in textures_of(board, [0]))
+    angles, _ = view.points.refined(*pair, 0, rotation.from_shift(home.shift), rotation.homography)
     return own, rotation.homography(angles) if np.isfinite(angles).all() else None
-
-
-def _own_angles(home: HomeView, photo: int, rotation: Rotation) -> Angles:
-    """The rotation from the group's view to a photo's; NaN where nothing tells."""
-    view, start = home.alignment.view, rotation.from_shift(home.alignment.shifts[photo])
-    if not np.isfinite(start).all():
-        return start
-    return home.alignment.points.refined(
-        home.textures[photo], view.brightness[photo], view.others[photo], start, rotation.homography
-    )[0]
 
 
 def _shared(turns: dict[int, Angles], focal: float, home: HomeView) -> dict[int, Angles]:
@@ -234,6 +228,6 @@ def _shared(turns: dict[int, Angles], focal: float, home: HomeView) -> dict[int,
     One photo's light tells a shift along the grain of wood to some tenths of a pixel only.
     """
     known = {i: one for i, one in turns.items() if np.isfinite(one).all()}
-    near = allowed_px(home.textures[0]) / focal
+    near = allowed_px(home.alignment.seen[0]) / focal
     alike = {i: [other for other in known.values() if np.linalg.norm(other - one) < near] for i, one in known.items()}
     return {i: np.median(some, axis=0) for i, some in alike.items()}

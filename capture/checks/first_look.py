@@ -13,7 +13,7 @@ from capture.checks.check_stack import check_stack
 from capture.errors import CaptureError
 from capture.photos.finding import Finding
 from capture.photos.photo import Photo, PhotoStack, read_small_photo, stack_of
-from capture.session.places import by_place
+from capture.session.capture import by_place
 from capture.session.seen import SeenPhotos
 from capture.session.session import Session, SessionSettings, load_settings, named_photos
 from capture.session.skipped import photos_of

@@ -60,9 +60,9 @@ class Framing:
     homography: Homography
     matches: int
     is_similarity: bool
-    seen: Points  # the matches, px of LONG_SIDE: in the board's photo
+    seen: Points  # the matches, px of the stack: in the board's photo
     to: Points  # ... and in the photos
-    factor: float  # from px of the stack to these
+    px: float  # of the stack, for one of the picture where points are looked for
 
     def scale(self) -> float:
         """How much larger the photos show things; of a similarity."""
@@ -78,7 +78,7 @@ class Framing:
         Args:
             long_side: of the stack, px.
         """
-        return len(np.unique(self.to // (long_side * self.factor / TILES), axis=0))
+        return len(np.unique(self.to // (long_side / TILES), axis=0))
 
     def sigma(self, width: int, height: int) -> float:
         """Error of where it takes places all over the picture, px: fits to samples of the matches differ by that.
@@ -88,16 +88,16 @@ class Framing:
         """
         grid, rng = _grid(width, height), np.random.default_rng(0)
         here = moved(self.homography, grid)
-        tile = np.unique(self.to // (LONG_SIDE / TILES), axis=0, return_inverse=True)[1].ravel()
+        tile = np.unique(self.to // (max(width, height) / TILES), axis=0, return_inverse=True)[1].ravel()
         members = [np.flatnonzero(tile == number) for number in range(tile.max() + 1)]
         apart = []
         for _ in range(BOOTSTRAPS):
             some = np.concatenate([members[number] for number in rng.integers(len(members), size=len(members))])
             again = _fitted(self.seen[some], self.to[some], self.is_similarity)
             if again is not None and np.isfinite(again).all():
-                apart.append(np.mean(np.square(moved(_of_stack(again, self.factor), grid) - here)))
+                apart.append(np.mean(np.square(moved(again, grid) - here)))
         by_samples = np.sqrt(2 * np.median(apart)) if apart else 0.0
-        return float(np.hypot(by_samples, NEAR_PX / self.factor / np.sqrt(len(members))))
+        return float(np.hypot(by_samples, NEAR_PX * self.px / np.sqrt(len(members))))
 
 
 def framing_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack | None) -> list[Finding]:
@@ -109,9 +109,7 @@ def framing_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStac
     """
     if board is None or board.rgb.shape[1:] != stack.rgb.shape[1:] or len(indices) < 2:
         return []
-    board_points = _points(_even(board, [0]))
-    photo_points = _points(_even(stack, indices))
-    framing = _framing(board_points, photo_points, _factor(stack))
+    framing = _framing(_points(board, [0]), _points(stack, indices))
     if framing is None:
         kind, text, value = _without_texture(stack, indices, board)
         chosen = indices[:1] if kind == NOT_COMPARED else indices
@@ -120,8 +118,7 @@ def framing_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStac
     if not kind:
         return []
     homography = tuple(float(value) for value in framing.homography.ravel())
-    to_file = stack.full_width / stack.rgb.shape[2]
-    value, limit = to_file * framing.sigma(*stack.rgb.shape[2:0:-1]), NEAR_PX * to_file
+    value, limit = stack.to_file * framing.sigma(*stack.rgb.shape[2:0:-1]), NEAR_PX * stack.to_file
     return [Finding(stack.paths[i], kind, text, value, limit, False, homography) for i in indices]
 
 
@@ -154,8 +151,7 @@ def _without_texture(stack: PhotoStack, indices: Sequence[int], board: PhotoStac
         text = f"EXIF says a focal length of {stack.focal_35mm:g} mm, and {board.focal_35mm:g} mm of "
         text += f"{board.paths[0].name}, the photo of the board: photograph the board again with the photos' zoom"
         return ZOOM_STATED, text, abs(zoom - 1)
-    halves = [_points(_even(stack, indices[start::2])) for start in (0, 1)]
-    shared = _framing(halves[0], halves[1], _factor(stack))
+    shared = _framing(*(_points(stack, indices[start::2]) for start in (0, 1)))
     own = shared.matches if shared else 0
     if shared is None or own < ENOUGH_SHARED or shared.tiles(max(stack.rgb.shape[1:3])) < SHARED_TILES * TILES**2:
         text = f"too little texture tells whether the camera stood still between {board.paths[0].name}, the photo of "
@@ -168,10 +164,6 @@ def _without_texture(stack: PhotoStack, indices: Sequence[int], board: PhotoStac
     return NOT_SHOWN, text, 0.0
 
 
-def _factor(stack: PhotoStack) -> float:
-    return min(1.0, LONG_SIDE / max(stack.rgb.shape[1:3]))
-
-
 def _even(stack: PhotoStack, indices: Sequence[int]) -> Grey:
     """The median of some photos with the same contrast everywhere, so that light and shadows do not count."""
     some = np.array(indices)[np.linspace(0, len(indices) - 1, min(len(indices), MEDIAN_OF)).round().astype(int)]
@@ -182,13 +174,15 @@ def _even(stack: PhotoStack, indices: Sequence[int]) -> Grey:
     return np.clip(128 + 40 * detail / np.maximum(strength, LEAST_CONTRAST), 0, 255).astype(np.uint8)
 
 
-def _points(grey: Grey) -> tuple[Points, np.ndarray | None]:
-    """Places and descriptors of distinct points."""
-    found, descriptors = cv2.SIFT.create(MOST_POINTS, contrastThreshold=FAINTEST).detectAndCompute(grey, None)
-    return np.array([one.pt for one in found], np.float32).reshape(-1, 2), descriptors
+def _points(stack: PhotoStack, indices: Sequence[int]) -> tuple[Points, np.ndarray | None, float]:
+    """Places (px of the stack) and descriptors of distinct points in some photos, and px of the stack for one there."""
+    px = max(1.0, max(stack.rgb.shape[1:3]) / LONG_SIDE)
+    sift = cv2.SIFT.create(MOST_POINTS, contrastThreshold=FAINTEST)
+    found, descriptors = sift.detectAndCompute(_even(stack, indices), None)
+    return (np.array([one.pt for one in found], np.float32).reshape(-1, 2) + 0.5) * px - 0.5, descriptors, px
 
 
-def _framing(board: tuple, photos: tuple, factor: float) -> Framing | None:
+def _framing(board: tuple, photos: tuple) -> Framing | None:
     """The motion that most matches agree on; None where it may be chance."""
     if min(len(board[0]), len(photos[0])) < FEWEST:
         return None
@@ -197,45 +191,43 @@ def _framing(board: tuple, photos: tuple, factor: float) -> Framing | None:
     if len(good) < FEWEST:
         return None
     seen = np.array([board[0][one.queryIdx] for one in good])
-    to = np.array([photos[0][one.trainIdx] for one in good])
+    to, px = np.array([photos[0][one.trainIdx] for one in good]), board[2]
     cv2.setRNGSeed(0)
-    affine, near = cv2.estimateAffinePartial2D(
-        seen, to, method=cv2.RANSAC, ransacReprojThreshold=NEAR_PX, maxIters=TRIALS
-    )
-    found = _counted(None if affine is None else np.vstack([affine, [0, 0, 1]]), near, seen, to, factor)
-    plane, near = cv2.findHomography(seen, to, cv2.RANSAC, NEAR_PX, maxIters=TRIALS)
-    homography = _counted(plane, near, seen, to, factor)
+    how = {"ransacReprojThreshold": NEAR_PX * px, "maxIters": TRIALS}
+    affine, near = cv2.estimateAffinePartial2D(seen, to, method=cv2.RANSAC, **how)
+    found = _counted(None if affine is None else np.vstack([affine, [0, 0, 1]]), near, seen, to, px)
+    homography = _counted(*cv2.findHomography(seen, to, cv2.RANSAC, **how), seen, to, px)
     if found is not None and (homography is None or found.matches >= SIMPLER * homography.matches):
         found = replace(found, is_similarity=True)
     else:
         found = homography
-    still = _still(seen, to)
-    if found is not None and len(np.unique(np.round(seen[still]), axis=0)) >= SIMPLER * found.matches:
-        return Framing(np.eye(3), int(still.sum()), True, seen[still], to[still], factor)
+    still = _still(seen, to, px)
+    if found is not None and len(np.unique(np.round(seen[still] / px), axis=0)) >= SIMPLER * found.matches:
+        return Framing(np.eye(3), int(still.sum()), True, seen[still], to[still], px)
     return found
 
 
-def _still(seen: Points, to: Points) -> Bool[np.ndarray, " matches"]:
+def _still(seen: Points, to: Points, px: float) -> Bool[np.ndarray, " matches"]:
     """Return the matches of a picture that stands still, or nearly: many in one direction would be rare by chance."""
-    apart = to - seen
+    apart = (to - seen) / px
     near = np.linalg.norm(apart, axis=1) <= AT_HOME * LONG_SIDE
     middle = np.median(apart[near], axis=0) if near.any() else np.zeros(2)
     return near & (np.linalg.norm(apart - middle, axis=1) <= NEAR_PX)
 
 
 def _counted(
-    matrix: Float[np.ndarray, "3 3"] | None, near: np.ndarray | None, seen: Points, to: Points, factor: float
+    matrix: Float[np.ndarray, "3 3"] | None, near: np.ndarray | None, seen: Points, to: Points, px: float
 ) -> Framing | None:
     """The motion with its matches, each place counted once; None where they are few, in one spot, or it is absurd."""
     if matrix is None or near is None:
         return None
     chosen = near.ravel() > 0
-    places = np.unique(np.round(np.hstack([seen[chosen], to[chosen]])), axis=0)
+    places = np.unique(np.round(np.hstack([seen[chosen], to[chosen]]) / px), axis=0)
     fewest = min((len(np.unique(places[:, columns], axis=0)) for columns in (slice(0, 2), slice(2, 4))), default=0)
     area = float(np.linalg.det(matrix[:2, :2]))
     if fewest < FEWEST or not LARGEST_ZOOM**-2 < area < LARGEST_ZOOM**2 or min(places.std(0)) < SPREAD_PX:
         return None
-    return Framing(_of_stack(matrix, factor), fewest, False, seen[chosen], to[chosen], factor)
+    return Framing(matrix, fewest, False, seen[chosen], to[chosen], px)
 
 
 def _fitted(seen: Points, to: Points, is_similarity: bool) -> Float[np.ndarray, "3 3"] | None:
@@ -247,13 +239,6 @@ def _fitted(seen: Points, to: Points, is_similarity: bool) -> Float[np.ndarray, 
     rows = np.concatenate([np.stack([u, -v, one, zero], -1), np.stack([v, u, zero, one], -1)])
     a, b, x, y = np.linalg.lstsq(rows, to.T.astype(float).ravel(), rcond=None)[0]
     return np.array([[a, -b, x], [b, a, y], [0.0, 0.0, 1.0]])
-
-
-def _of_stack(matrix: Float[np.ndarray, "3 3"], factor: float) -> Homography:
-    """A motion in px of LONG_SIDE as one in px of the stack."""
-    resize = np.array([[factor, 0, 0.5 * factor - 0.5], [0, factor, 0.5 * factor - 0.5], [0, 0, 1]])
-    moved = np.linalg.inv(resize) @ matrix @ resize
-    return moved / moved[2, 2]
 
 
 def _grid(width: int, height: int) -> Float[np.ndarray, "n 2"]:

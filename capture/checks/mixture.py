@@ -55,10 +55,8 @@ def levels(values: Float[np.ndarray, " photos"], noise: float) -> Float[np.ndarr
     order, n = known[np.argsort(values[known])], len(known)
     sums, found = np.append(0.0, np.cumsum(values[order])), np.full(len(values), np.nan)
     first, end = np.ogrid[: n + 1, : n + 1]
-    low, high = (
-        (first + end) // 2,
-        (first + end + 1) // 2,
-    )  # deviations from a group's median: its upper, less its lower half
+    # deviations from a group's median: its upper, less its lower half
+    low, high = (first + end) // 2, (first + end + 1) // 2
     off = np.where(end >= first, sums[end] - sums[high] - sums[low] + sums[first], np.inf)
     three = np.where((first > 0) & (end < n), off[0][:, None] + off + off[:, n][None], np.inf)
     cuts = [(), (int(np.argmin(off[0] + off[:, n])),), np.unravel_index(int(np.argmin(three)), three.shape)]

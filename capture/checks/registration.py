@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from capture.checks.robust import spread
-from capture.photos.channels import mean_of_channels
+from capture.photos.channels import in_blocks, mean_of_channels
 
 Shift = Float[np.ndarray, "2"]  # px of the stack, u and v; what the photo shows lies so far off
 Angles = Float[np.ndarray, "3"]  # of a rotation of the camera: its rotation vector, rad
@@ -56,6 +56,12 @@ def moved(motion: Homography, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndar
 def translation(shift: Shift) -> Homography:
     """The motion that shifts the picture by (u, v), px."""
     return np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]], [0.0, 0.0, 1.0]])
+
+
+def enlarged(motion: Homography, factor: float) -> Homography:
+    """The motion of a picture `factor` times as large; pixel centres have integer coordinates."""
+    resize = np.array([[factor, 0, 0.5 * factor - 0.5], [0, factor, 0.5 * factor - 0.5], [0, 0, 1]])
+    return resize @ motion @ np.linalg.inv(resize)
 
 
 @dataclass(frozen=True)
@@ -139,9 +145,7 @@ class Correlator:
 
 
 def _tiles(texture: Plane, side: int) -> Float[np.ndarray, "tiles side side"]:
-    rows, columns = texture.shape[0] // side, texture.shape[1] // side
-    cut = texture[: rows * side, : columns * side].reshape(rows, side, columns, side)
-    return cut.transpose(0, 2, 1, 3).reshape(-1, side, side)
+    return in_blocks(texture, side).reshape(-1, side, side)
 
 
 def _vertex(before: float, peak: float, after: float) -> float:
@@ -191,7 +195,7 @@ class Points:
             motion: of the picture by these numbers, 0: none.
         """
         lit = is_lit(brightness[self.rows, self.columns])
-        if lit.sum() < FEWEST_POINTS:
+        if lit.sum() < FEWEST_POINTS or not np.isfinite(start).all():
             return np.full(len(start), np.nan), np.full((len(start), len(start)), np.nan)
         pixels = np.stack([self.columns[lit], self.rows[lit]], -1).astype(float)
         common = self.values[half][lit].astype(float)

@@ -1,5 +1,7 @@
 """Standard deviations, quantiles and weights that a few wrong values do not change."""
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float
 
@@ -19,7 +21,7 @@ def column_spread(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray
     return MAD_TO_SIGMA * np.nanmedian(np.abs(values), axis=0) if len(values) else np.zeros(values.shape[1])
 
 
-def column_quantile(values: Float[np.ndarray, "rows columns"], share: float) -> Float[np.ndarray, " columns"]:
+def column_quantile(values: Float[np.ndarray, "rows ..."], share: float) -> Float[np.ndarray, "..."]:
     """Return the quantile of each column, linear between values; NaN is left out, NaN where a column has no value.
 
     The same as `np.nanquantile(values, share, axis=0)`, by one sort instead of one call per column.
@@ -29,6 +31,36 @@ def column_quantile(values: Float[np.ndarray, "rows columns"], share: float) -> 
     below = np.floor(rank).astype(int)
     low, high = (np.take_along_axis(ordered, at[None], 0)[0] for at in (below, np.ceil(rank).astype(int)))
     return (low + (rank - below) * (high - low)).astype(values.dtype)
+
+
+def lower_median(values: Float[np.ndarray, "..."], axis: int = 0) -> Float[np.ndarray, "..."]:
+    """Return the median of what is not NaN, of an even count the lower one; NaN where nothing is known."""
+    ordered, count = np.sort(values, axis=axis), (~np.isnan(values)).sum(axis, keepdims=True)
+    return np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis).squeeze(axis)
+
+
+def reweighted_fit(
+    basis: Float[np.ndarray, "n k"],
+    values: Float[np.ndarray, "fits n"],
+    weigh: Callable[[Float[np.ndarray, "fits n"]], Float[np.ndarray, "..."]],
+    rounds: int,
+    start: Float[np.ndarray, "fits n"],
+    stiffness: float = 0.0,
+) -> Float[np.ndarray, "fits k"]:
+    """Return the factors of `basis` that fit rows of values, by iteratively reweighted least squares.
+
+    Args:
+        weigh: weights of what is left of the values, for all rows alike if it returns one.
+        start: what the values are first compared with.
+        stiffness: added to the normal equations: how strongly factors are held at 0.
+    """
+    factors = np.zeros((len(values), basis.shape[1]))
+    for _ in range(rounds):
+        weight = np.broadcast_to(weigh(values - start), values.shape)
+        normal = np.einsum("fn,na,nb->fab", weight, basis, basis) + stiffness * np.eye(basis.shape[1])
+        factors = np.linalg.solve(normal, ((weight * values) @ basis)[..., None])[..., 0]
+        start = factors @ basis.T
+    return factors
 
 
 def cauchy(squares: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:

@@ -60,6 +60,12 @@ def read_exr(path: Path) -> dict[str, Float[np.ndarray, "height width"]]:
     return dict(zip(found.names, found.pixels, strict=True))
 
 
+def colour_channels(channels: Mapping[str, Float[np.ndarray, "height width"]]) -> Float[np.ndarray, "h w 3"] | None:
+    """Return R, G and B, or Y for all three; None where there are neither."""
+    names = ("R", "G", "B") if {"R", "G", "B"} <= set(channels) else ("Y", "Y", "Y")
+    return np.stack([channels[name] for name in names], 2) if names[0] in channels else None
+
+
 def _header(path: Path, answer: Answer | None) -> ExrHeader:
     if answer is None or len(answer.numbers) != 3:
         raise broken(path, "no header")

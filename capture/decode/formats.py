@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 from PIL import Image
 
-from capture.decode.exr import exr_size, read_exr
+from capture.decode.exr import colour_channels, exr_size, read_exr
 from capture.decode.heif import read_heif, read_heif_header
 from capture.decode.limits import broken, check_size
 from capture.decode.raw import raw_size, read_raw
 from capture.decode.sandbox import DAMAGED
-from capture.decode.tiff import opencv_channels, read_tiff, read_tiff_alpha
+from capture.decode.tiff import opencv_channels, read_tiff
 from capture.decode.video import read_clip, read_frame
 from capture.errors import CaptureError
 from capture.files.names import clip_of, is_shown
@@ -188,7 +188,7 @@ def decode(path: Path) -> DecodedPhoto:
         "heif": read_heif,
         "avif": read_heif,
         "png": _decode_png,
-        "tiff": lambda path: read_tiff(path, *_tiff_size(path)),
+        "tiff": lambda path: read_tiff(path, *_tiff_size(path))[0],
         "exr": _decode_exr,
         "clip": lambda path: read_frame(*(clip_of(path) or (path, 0.0))),
     }
@@ -252,7 +252,7 @@ def stored_channels(
     """
     kind = format_of(path)
     if kind == "tiff":
-        return read_tiff(path, *_tiff_size(path)), read_tiff_alpha(path, *_tiff_size(path))
+        return read_tiff(path, *_tiff_size(path))
     if kind not in ("jpeg", "png"):
         raise broken(path, f"{kind.upper()}, where a PNG, TIFF or JPEG is needed")
     read_size(path)
@@ -275,15 +275,13 @@ def _tiff_size(path: Path) -> tuple[int, int]:
 
 
 def _decode_exr(path: Path) -> Float[np.ndarray, "height width 3"]:
-    """Decode R, G and B, or Y for all three. The values are linear: negative ones are noise and become 0."""
+    """Decode the colour. The values are linear: negative ones are noise and become 0."""
     check_size(path, *exr_size(path))
     channels = read_exr(path)
-    names = ("R", "G", "B") if {"R", "G", "B"} <= set(channels) else ("Y", "Y", "Y")
-    if names[0] not in channels:
+    if (pixels := colour_channels(channels)) is None:
         raise CaptureError(
             f"{path} has the channels {', '.join(sorted(channels))}; R, G and B, or Y, are needed. Export a picture."
         )
-    pixels = np.stack([channels[name] for name in names], 2)
     if not np.isfinite(pixels).all():
         raise CaptureError(f"{path} holds values that are not finite, numbers are needed. Export it again.")
     return np.maximum(pixels, np.float32(0))

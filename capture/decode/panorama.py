@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from capture.decode.exr import ExrHeader, exr_header, read_exr
+from capture.decode.exr import ExrHeader, colour_channels, exr_header, read_exr
 from capture.decode.limits import BrokenFile
 from capture.errors import CaptureError
 
@@ -85,10 +85,9 @@ def _read_exr(data: bytes, name: str) -> Float[np.ndarray, "rows columns 3"]:
             channels = read_exr(path)
         except BrokenFile as error:
             raise CaptureError(f"{name}: not a readable OpenEXR file ({error.reason}); copy it again.") from error
-    names = ("R", "G", "B") if {"R", "G", "B"} <= set(channels) else ("Y", "Y", "Y")
-    if not set(names) <= set(channels):
+    if (picture := colour_channels(channels)) is None:
         raise CaptureError(f"{name}: channels {', '.join(sorted(channels))}; R, G and B (or Y) were needed.")
-    return np.stack([channels[c] for c in names], -1)
+    return picture
 
 
 def _check_exr(header: ExrHeader, name: str) -> None:

@@ -14,32 +14,23 @@ from capture.decode.sandbox import SAMPLES, Answer, decoding
 
 ORIENTATION = 274  # tag
 STRIP_ROWS = 256
-MOST_BYTES_PER_PIXEL = 12  # float32
+MOST_BYTES_PER_PIXEL = 16  # float32
 
 
-def read_tiff(path: Path, width: int, height: int) -> Shaped[np.ndarray, "height width 3"]:
-    """Return RGB of 8 or 16 bits or float32; width and height (px) are those in its tags.
+def read_tiff(
+    path: Path, width: int, height: int
+) -> tuple[Shaped[np.ndarray, "height width 3"], Shaped[np.ndarray, "height width"] | None]:
+    """Return RGB of 8 or 16 bits or float32, and alpha (None if absent); width and height (px) are those in its tags.
 
     Raises:
         CaptureError: the file is too large or damaged, or has samples of another type.
     """
-    return colour_of(path, _read(path, width, height, has_alpha=False))
-
-
-def read_tiff_alpha(path: Path, width: int, height: int) -> Shaped[np.ndarray, "height width"] | None:
-    """Return the alpha channel; None if there is none.
-
-    Raises:
-        CaptureError: as `read_tiff`.
-    """
-    return _read(path, width, height, has_alpha=True)
-
-
-def _read(path: Path, width: int, height: int, has_alpha: bool) -> Shaped[np.ndarray, "..."] | None:
     check_size(path, width, height)
-    with decoding(tiff_picture, path, has_alpha) as answer:
+    with decoding(tiff_picture, path) as answer:
         found = answer(MOST_BYTES_PER_PIXEL * width * height, width * height)
-    return None if found is None else found.pixels
+    if found is None or found.pixels is None or found.pixels.shape[2:] != (4,):
+        return colour_of(path, found and found.pixels), None
+    return np.ascontiguousarray(found.pixels[..., :3]), found.pixels[..., 3]
 
 
 def opencv_channels(
@@ -63,8 +54,8 @@ def opencv_channels(
     return stored, None
 
 
-def tiff_picture(file: BinaryIO, has_alpha: bool) -> Iterator[Answer]:
-    """Task: answer RGB, or with `has_alpha` only the alpha channel if there is one; 8 or 16-bit, or float32.
+def tiff_picture(file: BinaryIO) -> Iterator[Answer]:
+    """Task: answer RGB, with alpha as a fourth channel if there is one; 8 or 16-bit, or float32.
 
     Raises:
         OSError: the file cannot be decoded, or has samples of another type.
@@ -72,9 +63,7 @@ def tiff_picture(file: BinaryIO, has_alpha: bool) -> Iterator[Answer]:
     data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
     _ignore_orientation(data)
     colour, alpha = opencv_channels(data)
-    pixels = alpha if has_alpha else colour
-    if pixels is None:
-        return
+    pixels = colour if alpha is None else np.dstack([colour, alpha])
     if pixels.dtype == np.float64:
         pixels = pixels.astype(np.float32)
     if pixels.dtype.name not in SAMPLES:

@@ -51,7 +51,7 @@ def read_regular(path: Path, largest: int = LARGEST_TEXT) -> bytes:
         OSError: as `open_regular`.
     """
     with open_regular(path, largest) as file:
-        return file.read(largest + 1)[:largest]
+        return file.read(min(os.fstat(file.fileno()).st_size, largest))  # a buffer of `largest` bytes may be large
 
 
 def is_regular(path: Path) -> bool:

@@ -11,7 +11,7 @@ from capture.decode.formats import format_of, is_photo_name
 from capture.errors import CaptureError
 from capture.files.atomic import flush_folder
 from capture.files.names import DEVICES, is_clip_name
-from capture.session.session import MASK, PHONE_BACK, ROLE_FOLDERS
+from capture.session.sorting import MASK, PHONE_BACK, ROLE_FOLDERS, is_sorted
 
 LARGEST_PHOTO = 400 << 20  # bytes: a RAW file of 100 megapixels has 200 MB
 LARGEST_CLIP = 8 << 30  # bytes: ten minutes of 4K have 4 GB
@@ -100,8 +100,7 @@ def place_in(capture: Path, relative: str, role: str = "") -> Path:
         return capture / name
     parents = [part.lower() for part in re.split(r"[/\\]", relative)[:-1]]
     folder = ROLE_FOLDERS.get(role) or next((part for part in reversed(parents) if part in FOLDERS), "")
-    is_sorted = any((capture / ROLE_FOLDERS[known]).is_dir() for known in ("board", "lit"))
-    if is_sorted:
+    if is_sorted(capture):
         return capture / (folder or ROLE_FOLDERS["lit"]) / name
     has_loose = any(is_photo_name(path) or is_clip_name(path) for path in capture.iterdir() if path.is_file())
     keeps = folder == ROLE_FOLDERS["side"] or not has_loose  # side/ is read beside loose photos, too

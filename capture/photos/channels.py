@@ -15,6 +15,12 @@ def mean_of_channels(picture: Float[np.ndarray, "*places channels"]) -> Float[np
     return total
 
 
+def in_blocks(picture: Float[np.ndarray, "height width"], side: int) -> Float[np.ndarray, "rows columns side side"]:
+    """Return a picture as square blocks; incomplete ones at the right and bottom are cut off."""
+    rows, columns = (n // side for n in picture.shape)
+    return picture[: rows * side, : columns * side].reshape(rows, side, columns, side).transpose(0, 2, 1, 3)
+
+
 def largest_channel(picture: Shaped[np.ndarray, "height width 3"]) -> Shaped[np.ndarray, "height width"]:
     """Return the largest of each pixel's channels."""
     return np.asarray(cv2.max(cv2.max(picture[..., 0], picture[..., 1]), picture[..., 2]))

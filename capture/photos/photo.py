@@ -62,6 +62,11 @@ class PhotoStack:
     focal_35mm: float | None = None  # 35 mm equivalent focal length of the first photo, mm
     is_linear: bool = False  # no photo's tone curve had to be assumed: RAW, or files that hold linear numbers
 
+    @property
+    def to_file(self) -> float:
+        """Pixels of a file for one of the stack."""
+        return self.full_width / self.rgb.shape[2]
+
 
 def decode_srgb(values: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """Decode sRGB (IEC 61966-2-1) to linear float32; uint8 is divided by 255, uint16 by 65535, floats are in 0..1."""

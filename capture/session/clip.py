@@ -167,10 +167,8 @@ def _candidates(clip: Path) -> _Candidates:
             entry = (time_s, energy, motion, cells_of(decode_srgb(thumbnail)))
             found = [*found, entry] if is_new else [*found[:-1], entry]
         if len(found) > 2 * MOST_CANDIDATES:  # the container does not state the clip's length
-            found, slot = (
-                [max(pair, key=lambda c: c[1]) for pair in zip(found[::2], found[1::2], strict=False)],
-                2 * slot,
-            )
+            found = [max(pair, key=lambda c: c[1]) for pair in zip(found[::2], found[1::2], strict=False)]
+            slot *= 2
     if found and found[-1][0] > 4 * TOUCHED_S:
         end = found[-1][0] - TOUCHED_S
         found = [entry for entry in found if TOUCHED_S <= entry[0] <= end]

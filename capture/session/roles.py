@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from capture.decode.exif import PhotoHeader, read_header
 from capture.errors import CaptureError, Remedy
-from capture.photos.channels import mean_of_channels
+from capture.photos.channels import in_blocks, mean_of_channels
 from capture.photos.photo import decode_srgb, read_thumbnail
 
 THUMBNAIL_PX = 320  # large enough for the grain of a table, small enough to compare forty photos in a second
@@ -164,19 +164,12 @@ def features_of(path: Path) -> PhotoFeatures:
 
 def cells_of(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, " cells"]:
     """Return the brightness of square cells of a thumbnail, row by row: of light parts, to ignore printed squares."""
-    return np.percentile(_blocks(brightness, CELL_PX), 80, axis=1)
+    return np.percentile(in_blocks(brightness, CELL_PX).reshape(-1, CELL_PX**2), 80, axis=1)
 
 
 def evenness(cells: Float[np.ndarray, " cells"]) -> float:
     """Return the brightness of dim cells over the median one: near 1 in room light."""
     return float(np.percentile(cells, 5)) / max(float(np.median(cells)), BLACK)
-
-
-def _blocks(values: Float[np.ndarray, "height width"], side: int) -> Float[np.ndarray, "blocks samples"]:
-    """Return square blocks of a picture, row by row; incomplete ones at the right and bottom are cut off."""
-    rows, columns = values.shape[0] // side, values.shape[1] // side
-    cut = values[: rows * side, : columns * side].reshape(rows, side, columns, side)
-    return cut.transpose(0, 2, 1, 3).reshape(rows * columns, side * side)
 
 
 def _texture(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
@@ -189,7 +182,7 @@ def _texture(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray,
 
 def tiles_of(texture: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "tiles samples"]:
     """Return a texture in tiles of mean 0 and length 1."""
-    tiles = _blocks(texture, TILE_PX)
+    tiles = in_blocks(texture, TILE_PX).reshape(-1, TILE_PX**2)
     tiles = tiles - tiles.mean(1, keepdims=True)
     return tiles / np.maximum(np.linalg.norm(tiles, axis=1, keepdims=True), NOISE)
 

@@ -15,10 +15,9 @@ from capture.photos.finding import Finding
 from capture.photos.photo import readers_at_once
 from capture.session.roles import PhotoFeatures, features_of
 
-SAME_STEPS = (
-    1.0  # of 255, root mean square: photos saved again, at quality 80 or half the size, differed by 0.2 to 0.6,
-)
-# those of six captures with the light in another place by 6 to 20
+# of 255, root mean square: photos saved again, at quality 80 or half the size, differed by 0.2 to 0.6, those of six
+# captures with the light in another place by 6 to 20
+SAME_STEPS = 1.0
 Found = TypeVar("Found")
 
 

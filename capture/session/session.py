@@ -129,7 +129,7 @@ def load_session(folder: Path, common: SessionSettings | None = None, seen: Seen
         thickness = common.board_thickness_mm if thickness is None else thickness
         settings = structs.replace(settings, board=settings.board or common.board, board_thickness_mm=thickness)
     seen = SeenPhotos() if seen is None else seen
-    with naming_skipped(folder, ROLE_FOLDERS.values()) as skipped:
+    with naming_skipped(folder) as skipped:
         roles, left_out, notes = _roles(folder, settings, seen, needs_board=common is None)
     notes += skipped
     if is_sorted(folder) and "board" not in settings.roles:
@@ -251,11 +251,8 @@ def _roles(
         if not clips:
             said = f"{error} Left out: {grouped(sound.left_out)}."
             raise (type(error)(said) if sound.left_out else error) from None
-        left_out, loose, stills = (
-            sound.left_out,
-            tuple(sound.by_role[""]),
-            replace(sound, by_role=sound.by_role | {"": []}),
-        )
+        left_out, loose = sound.left_out, tuple(sound.by_role[""])
+        stills = replace(sound, by_role=sound.by_role | {"": []})
         roles, notes = sorted_roles(stills, seen)[0], ()
         for clip in clips:
             frames = choose_frames(clip, settings.clip_frames)
@@ -346,7 +343,7 @@ def _unread(folder: Path) -> str:
     """
     files = [path for path in folder.iterdir() if path.is_file() and not is_beside(path)]
     loose = [path for path in files if is_photo_name(path) or is_clip_name(path)]
-    if loose and any((folder / name).is_dir() for name in (ROLE_FOLDERS["board"], ROLE_FOLDERS["lit"])):
+    if loose and is_sorted(folder):
         return f"{len(loose)} photos or clips are beside its folders ({loose[0].name}, ...): move them into these."
     clips = clips_in(folder / ROLE_FOLDERS["lit"])
     return f"The clip photos/{clips[0].name} is not read beside photos: remove the clip or the photos." if clips else ""

@@ -4,7 +4,7 @@ The photos and clips that a capture folder holds, by their names; nothing is ope
 """
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -41,9 +41,9 @@ def clips_of(capture: Path) -> list[Path]:
     return [path for place in places for path in sorted(place.iterdir()) if is_clip_name(path) and path.is_file()]
 
 
-def skipped_pictures(folder: Path, below: Iterable[str]) -> str:
-    """Return a sentence on the pictures that are not read in a folder, and in folders of these names in it; or ""."""
-    places = [place for place in (folder, *(folder / name for name in below)) if place.is_dir()]
+def skipped_pictures(folder: Path) -> str:
+    """Return a sentence on the pictures that are not read in a capture's folders; or ""."""
+    places = [place for place in (folder, *(folder / name for name in ROLE_FOLDERS.values())) if place.is_dir()]
     found = [path for place in places for path in sorted(place.iterdir()) if _is_skipped(path) and path.is_file()]
     if not found:
         return ""
@@ -52,9 +52,9 @@ def skipped_pictures(folder: Path, below: Iterable[str]) -> str:
 
 
 @contextmanager
-def naming_skipped(folder: Path, below: Iterable[str]) -> Iterator[tuple[str, ...]]:
+def naming_skipped(folder: Path) -> Iterator[tuple[str, ...]]:
     """Yield what is to be noted of skipped pictures; an error of the block ends with it, too."""
-    said = skipped_pictures(folder, below)
+    said = skipped_pictures(folder)
     try:
         yield (said,) if said else ()
     except CaptureError as error:
