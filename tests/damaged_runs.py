@@ -32,7 +32,7 @@ from reconstruct.detail.surface import Window
 from reconstruct.fields import FurtherView, SolvedScene, Verdict, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
 from reconstruct.solve.checkpoint import write_checkpoint
-from viewer.stage.pack_file import write_stage
+from viewer.stage.page import write_stage
 
 MARKUP = "<script>alert('shadowgraph')</script><img src=x onerror=alert(1)>&\"'"  # text that must stay text
 JSON = ("calibration.json", "report.json", "manifest.json", "check.json", "config.json", "memory.json", "stage.json")

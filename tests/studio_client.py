@@ -16,9 +16,8 @@ from test_queue import PROGRAM
 from waiting import PATIENCE_S, wait_until
 
 from viewer.studio.folder import StudioFolder
-from viewer.studio.sockets import free_socket, http_server
 from viewer.studio.studio import Studio
-from viewer.studio_server.gate import Gate, OwnerSecret
+from viewer.studio_server.gate import Gate, OwnerSecret, free_socket, http_server
 from viewer.studio_server.phones import Phones
 from viewer.studio_server.routes import owner_app
 from viewer.studio_server.serve import PhoneRoutes

@@ -23,7 +23,7 @@ from reconstruct.render import relight, studio
 from reconstruct.render.g_buffer import seen_material
 from reconstruct.render.studio import studio_of, turntable
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.report.formats import FORMATS
+from viewer.stage.page import FORMATS
 
 SMALL = ExportOptions(faces=800, texture=128, width=160, frames=3, lamp_size=0.0)
 

@@ -17,7 +17,6 @@ from test_intake import jpeg
 from test_studio import capture_in, run_in
 from waiting import wait_until
 
-from viewer.studio import sockets
 from viewer.studio_server import gate, phones
 from viewer.studio_server.gate import WEB
 from viewer.studio_server.routes import owner_app
@@ -128,7 +127,7 @@ STRANGE = {
     "a list": [["a"]],
     "an object": {"a": {}},
 }
-UNTRIED = ("/api/leave", "/api/send_away", "/api/try_example")  # others would be refused then; it copies 45 photos
+UNTRIED = ("/api/send_away", "/api/try_example")  # others would be refused then; it copies 45 photos
 NAMES = ("key", "title", "photo", "part", "id", "board", "role", "preset", "job", "action", "format", "size", "paper")
 NAMES += ("token", "name", "capture")
 
@@ -224,7 +223,7 @@ def test_a_phone_sends_to_the_capture_of_its_door_alone_and_reaches_nothing_else
     assert phone.send("secret", "phone.jpg", jpeg(9)).status == 204
     names = {key: [p["name"] for p in owner.get(f"/api/capture?key={key}")[1]["photos"]] for key in ("vase", "secret")}
     assert "photos/phone.jpg" in names["vase"] and "photos/phone.jpg" not in names["secret"]
-    for path in ("/app.js", "/api/capture?key=vase", "/api/phones", "/report?key=runs/vase", "/api/folders"):
+    for path in ("/api/capture?key=vase", "/api/phones", "/report?key=runs/vase", "/api/folders"):
         assert phone.raw("GET", path).status == 404
     assert phone.raw("POST", "/api/delete", b'{"key": "vase"}').status in (404, 405)
     assert phone.raw("POST", "/upload", b"", Origin="http://evil.example").status == 403
@@ -268,7 +267,7 @@ def test_a_full_disk_is_a_sentence_to_a_phone_whose_file_goes_on_once_there_is_r
 
 
 def test_two_programs_that_ask_for_one_port_at_once_get_two():
-    with sockets.free_socket("127.0.0.1", 8600) as one, sockets.free_socket("127.0.0.1", 8600) as other:
+    with gate.free_socket("127.0.0.1", 8600) as one, gate.free_socket("127.0.0.1", 8600) as other:
         assert one.getsockname() != other.getsockname()
 
 

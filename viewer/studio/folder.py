@@ -3,11 +3,13 @@
 What was deleted: moved aside within the studio's folder, put back on request, gone once the trash is emptied.
 """
 
+import contextlib
 import os
 import secrets
 import shutil
 import time
 from dataclasses import asdict, dataclass
+from hashlib import sha256
 from pathlib import Path
 
 from capture.errors import CaptureError, UserError
@@ -207,6 +209,21 @@ class StudioFolder:
         except OSError:
             return []
         return [path for path in found[:MOST_FOLDERS] if path.resolve().is_relative_to(self.root)]
+
+
+def mark_of(*paths: Path) -> str:
+    """Return a name that changes with the sizes and times of these files; "" where none is there."""
+    rows = []
+    for path in paths:
+        with contextlib.suppress(OSError):
+            stat = path.stat()
+            rows.append(f"{path} {stat.st_size} {stat.st_mtime_ns}")
+    return sha256("\n".join(rows).encode("utf-8", "surrogateescape")).hexdigest()[:24] if rows else ""
+
+
+def without_folder(text: str, folder: Path, called: str = "this folder") -> str:
+    """Return a sentence with the names of files without this folder: where it lies is the studio's machine's alone."""
+    return text.replace(f"{folder}{os.sep}", "").replace(str(folder), called)
 
 
 def is_run(folder: Path) -> bool:

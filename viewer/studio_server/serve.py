@@ -19,16 +19,24 @@ from starlette.types import ASGIApp
 from capture.errors import CaptureError, UserError
 from viewer.page.guard import COOKIE
 from viewer.studio.folder import CAPTURES, RUNS, StudioFolder, is_capture, is_run
-from viewer.studio.sockets import free_socket, http_server
 from viewer.studio.studio import Studio
-from viewer.studio_server.gate import Gate, OwnerSecret, file_routes, read_object, sentences, text_of, web_file
-from viewer.studio_server.phones import EVERYWHERE, Door, Phone, Phones
+from viewer.studio_server.gate import (
+    FILES,
+    Gate,
+    OwnerSecret,
+    file_routes,
+    free_socket,
+    http_server,
+    read_object,
+    sentences,
+    text_of,
+    web_file,
+)
+from viewer.studio_server.phones import EVERYWHERE, Door, Phones
 from viewer.studio_server.routes import owner_app
 from viewer.studio_server.uploads import Uploads
 
 COOKIE_NAME = f"{COOKIE}-phone"
-FILES = ("studio.css", "dom.js", "phone.js", "album.js", "live.js", "upload.js", "hemisphere.js", "voice.js")
-FILES += ("icon.svg",)
 FREE = {"/", "/live", "/join", *(f"/{name}" for name in FILES)}  # what a phone gets that is not in yet
 HOST = "127.0.0.1"
 
@@ -45,13 +53,12 @@ class PhoneRoutes:
         """Return the application of the phones' listeners."""
         self._phones = phones
         routes = [
-            *file_routes(FILES, "phone.html"),
+            *file_routes("phone.html"),
             Route("/live", self.live, methods=["GET"]),
             Route("/join", self.join, methods=["POST"]),
             Route("/api/state", self.state, methods=["GET"]),
             Route("/api/role", self.role, methods=["POST"]),
-            Route("/api/leave", self.leave, methods=["POST"]),
-            *Uploads(self._studio.parts, self._target, lambda request: self._mine(request).id).routes(),
+            *Uploads(self._studio.parts, lambda *_: self._door().capture, lambda r: r.state.phone.id).routes(),
         ]
         return Gate(
             Starlette(routes=routes, exception_handlers=sentences(self._studio.folder.root)), EVERYWHERE, self._admits
@@ -71,44 +78,29 @@ class PhoneRoutes:
 
     async def state(self, request: Request) -> Response:
         """Say how the capture is doing that the phone sends to."""
-        phone, door = self._mine(request), self._door()
+        phone, door = request.state.phone, self._door()
         found = await to_thread.run_sync(self._studio.for_phone, door.capture)
         return JSONResponse(found | {"name": phone.name, "role": phone.role, "shots": door.shots})
 
     async def role(self, request: Request) -> Response:
         """Note what a phone does in live mode."""
         values = await read_object(request)
-        self._phones.set_role(self._mine(request), text_of(values, "role"))
-        return JSONResponse({"done": None})
-
-    async def leave(self, request: Request) -> Response:
-        """Forget a phone."""
-        self._phones.leave(self._mine(request).secret)
+        self._phones.set_role(request.state.phone, text_of(values, "role"))
         return JSONResponse({"done": None})
 
     def _admits(self, request: Request) -> Response | None:
         if self._phones.door is None:
             return PlainTextResponse("Phones are not let in at the moment.\n", 403)
-        if request.url.path in FREE or self._phones.find(request.cookies.get(COOKIE_NAME, "")) is not None:
+        request.state.phone = self._phones.find(request.cookies.get(COOKIE_NAME, ""))
+        if request.url.path in FREE or request.state.phone is not None:
             return None
         return JSONResponse({"error": "This phone is not in. Scan the new code that the studio shows."}, 401)
-
-    def _mine(self, request: Request) -> Phone:
-        phone = self._phones.find(request.cookies.get(COOKIE_NAME, ""))
-        if phone is None:
-            raise CaptureError("This phone is not in any more. Scan the new code that the studio shows.")
-        return phone
 
     def _door(self) -> Door:
         door = self._phones.door
         if door is None:
             raise CaptureError("Phones are not let in any more.")
         return door
-
-    def _target(self, request: Request, _key: str) -> str:
-        """Return the capture that phones send to, whichever they name."""
-        self._mine(request)
-        return self._door().capture
 
 
 def serve(
