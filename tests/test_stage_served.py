@@ -75,7 +75,6 @@ def eventually(address: str, path: str) -> bytes:
 
 def test_a_run_that_is_not_finished_says_so(tmp_path):
     files = StageFiles(tmp_path)
-    assert not files.is_ready
     with pytest.raises(UserError, match="no finished run"):
         files.get("")
 

@@ -20,7 +20,7 @@ from waiting import wait_until
 from viewer.studio_server import gate, phones
 from viewer.studio_server.gate import WEB
 from viewer.studio_server.routes import owner_app
-from viewer.studio_server.serve import PhoneRoutes
+from viewer.studio_server.serve import phone_app
 
 LOCAL_STYLE = re.compile(r"\bstyle\s*=|<style|javascript:|\bon\w+\s*=\s*[\"']", re.IGNORECASE)
 
@@ -138,7 +138,7 @@ def test_no_value_of_a_request_is_a_fault_of_the_program_at_any_address(let_in, 
     door, owner, port, token = let_in
     phone = joined(port, token)
     studio = open_studio[0]
-    everybody = (phone, PhoneRoutes(studio).app(door)._app), (owner, owner_app(studio, door))
+    everybody = (phone, phone_app(studio, door)._app), (owner, owner_app(studio, door))
     words = quote(str(value), errors="surrogateescape" if value == "\udcff" else "surrogatepass")
     query = "&".join(f"{name}={words}" for name in ("key", "photo", "board", "paper", "format", "size", "token"))
     headers = {"Upload-Length": words, "Upload-Metadata": f"filename {words}", "Upload-Offset": words}

@@ -1,4 +1,4 @@
-"""Every attack here works against viser alone, or with one guard taken away: the tests say which, and try it."""
+"""What strangers may try on the page of a run; several attacks are shown to work where a guard is taken away."""
 
 import asyncio
 import hmac
@@ -20,7 +20,7 @@ from waiting import PATIENCE_S
 
 from reconstruct.run.bundle import without_paths
 from viewer.page import guard
-from viewer.page.guard import GuardedServer, InvalidMessage, is_loopback, refuse_strange
+from viewer.page.guard import GuardedServer, fault_of, is_loopback
 from viewer.page.serve import address_lines, view
 
 ANY_PORT = 0
@@ -36,12 +36,6 @@ def serving(kind, host="127.0.0.1"):
 @pytest.fixture(scope="module")
 def server():
     yield from serving(GuardedServer)
-
-
-@pytest.fixture(scope="module")
-def plain():
-    """viser as it comes."""
-    yield from serving(lambda **options: viser.ViserServer(verbose=False, **options))
 
 
 @pytest.fixture(scope="module")
@@ -116,9 +110,8 @@ def test_the_page_listens_on_this_machine_alone_unless_asked(server):
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", None, "http://localhost:3000", "http://127.0.0.1"])
-def test_another_page_in_the_same_browser_cannot_open_the_websocket(server, plain, origin):
+def test_another_page_in_the_same_browser_cannot_open_the_websocket(server, origin):
     assert talk(server.get_port(), origin=origin) == 403
-    assert talk(plain.get_port(), origin=origin) == 101
 
 
 @pytest.mark.parametrize(
@@ -132,9 +125,8 @@ def test_another_page_in_the_same_browser_cannot_open_the_websocket(server, plai
         {"Host": "localhost", "Origin": "http://[::1"},
     ],
 )
-def test_a_foreign_name_that_resolves_to_this_machine_gets_nothing(server, plain, headers):
+def test_a_foreign_name_that_resolves_to_this_machine_gets_nothing(server, headers):
     assert get(server.get_port(), **headers).status == 403
-    assert get(plain.get_port(), **headers).status == 200
 
 
 @pytest.mark.parametrize(
@@ -154,12 +146,11 @@ def test_two_hosts_origins_or_upgrades_in_one_request_are_refused(server, name, 
         assert b" 403 " in tcp.recv(100)
 
 
-def test_no_other_page_may_show_this_one_in_a_frame_and_it_loads_nothing_from_elsewhere(server, plain):
-    answer, bare = get(server.get_port()), get(plain.get_port())
+def test_no_other_page_may_show_this_one_in_a_frame_and_it_loads_nothing_from_elsewhere(server):
+    answer = get(server.get_port())
     policy = answer.headers["Content-Security-Policy"]
     assert "frame-ancestors 'none'" in policy and "connect-src 'self' data: blob:;" in policy
     assert answer.headers["X-Frame-Options"] == "DENY" and answer.headers["Referrer-Policy"] == "no-referrer"
-    assert bare.headers["X-Frame-Options"] is None and bare.headers["Content-Security-Policy"] is None
 
 
 # --- over a network: the token ---------------------------------------------------------------------------------------
@@ -262,7 +253,7 @@ def test_a_client_cannot_open_the_public_share_tunnel(monkeypatch, is_guarded):
     monkeypatch.setattr(viser._viser, "ViserTunnel", RecordedTunnel)
     RecordedTunnel.opened = 0
     if not is_guarded:
-        monkeypatch.setattr(guard, "refuse_strange", lambda _: None)
+        monkeypatch.setattr(guard, "fault_of", lambda _: "")
     for asked in serving(GuardedServer):
         taken = only_closed if is_guarded else lambda: RecordedTunnel.opened
         talk(asked.get_port(), {"type": "ShareUrlRequest"}, taken=taken)
@@ -301,15 +292,14 @@ STRANGE = [
 
 @pytest.mark.parametrize("message", STRANGE, ids=lambda one: one["type"])
 def test_files_pictures_and_large_messages_end_the_connection(server, message):
-    with pytest.raises(InvalidMessage):
-        refuse_strange(msgspec.msgpack.encode(message))
+    assert fault_of(msgspec.msgpack.encode(message))
     assert talk(server.get_port(), message, taken=only_closed) == REFUSED
 
 
 @pytest.mark.parametrize("is_guarded", [True, False])
 def test_a_message_changes_the_value_of_a_control_and_nothing_else_about_it(monkeypatch, is_guarded):
     if not is_guarded:
-        monkeypatch.setattr(guard, "refuse_strange", lambda _: None)
+        monkeypatch.setattr(guard, "fault_of", lambda _: "")
     for asked in serving(GuardedServer):
         slider = asked.gui.add_slider("Photo", 1, 5, 1, 1)
         update = {"type": "GuiUpdateMessage", "uuid": slider._impl.uuid}

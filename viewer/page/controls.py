@@ -123,7 +123,7 @@ def _answer(now: Status, log: Sequence[Mapping[str, Any]], asked: frozenset[str]
     if not open_ones:
         return ""
     when = "in a moment" if str(last.get("stage", "")) in SOLVING else "once the surface is being fitted"
-    return f"Asked for: {', '.join(open_ones)}. It follows {when}."
+    return f"Asked for: {', '.join(open_ones)}. It takes effect {when}."
 
 
 class Controls:

@@ -77,35 +77,28 @@ OWN_HEADERS = SAFE_HEADERS | {
 }
 
 
-class InvalidMessage(Exception):
-    """A message that our page never sends; the connection is closed."""
-
-
 class _Message(msgspec.Struct):
     type: str
     updates: Any = None
 
 
-def refuse_strange(raw: bytes | str) -> None:
-    """Return if the page sends such messages.
-
-    Raises:
-        InvalidMessage: it is malformed, large, of another kind, or changes more of a control than its value.
-    """
+def fault_of(raw: bytes | str) -> str:
+    """Return why a message is none that our page sends, "" for one that it does."""
     if isinstance(raw, str) or len(raw) > LARGEST:
-        raise InvalidMessage(f"{len(raw)} characters or bytes, where the page sends at most {LARGEST} bytes")
+        return f"{len(raw)} characters or bytes, where the page sends at most {LARGEST} bytes"
     try:
         message = msgspec.msgpack.decode(raw, type=_Message)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InvalidMessage("not a message") from error
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return "not a message"
     if message.type not in KINDS:
-        raise InvalidMessage("a kind that the page does not send")
+        return "a kind that the page does not send"
     if message.type == VALUE and not (isinstance(message.updates, dict) and set(message.updates) == {"value"}):
-        raise InvalidMessage("a control's value is all that the page changes")
+        return "a control's value is all that the page changes"
+    return ""
 
 
 class GuardedServer(viser.ViserServer):
-    """A ViserServer behind `is_own_page` and `refuse_strange`, without its banner and its public share tunnel."""
+    """A ViserServer behind `is_own_page` and `fault_of`, without its banner and its public share tunnel."""
 
     def __init__(self, host: str, port: int, stage: StageFiles | None = None, title: str = "Shadowgraph"):
         """Serve on this host and port, or on the next free port, see `get_port`.
@@ -269,14 +262,11 @@ class _GuardedConnection(ServerConnection):
 
     async def recv(self, decode: bool | None = None) -> Any:
         message = await super().recv(decode)
-        if not _is_stage_document(self.request):
-            try:
-                refuse_strange(message)
-            except InvalidMessage as error:
-                closing = asyncio.create_task(self.close(CloseCode.POLICY_VIOLATION, str(error)))
-                while not closing.done():  # messages under way must be read, or the connection never closes
-                    await super().recv(decode)
-                await super().recv(decode)  # raises ConnectionClosed
+        if not _is_stage_document(self.request) and (fault := fault_of(message)):
+            closing = asyncio.create_task(self.close(CloseCode.POLICY_VIOLATION, fault))
+            while not closing.done():  # messages under way must be read, or the connection never closes
+                await super().recv(decode)
+            await super().recv(decode)  # raises ConnectionClosed
         return message
 
 

@@ -52,7 +52,7 @@ def check_page(checked: CaptureCheck) -> str:
             "Light",
             "Each dot is the flashlight in one photo. Light from all sides, low and high, shows the whole shape.",
             doc.row(
-                doc.figure(coverage(calibration, cover.centre), "Seen from the object: above in the middle"),
+                doc.figure(coverage(calibration, cover.centre), "From the object: overhead is in the middle"),
                 doc.figure(lights_from_above(calibration, None), "Seen from above, with two-sigma ellipses"),
             ),
         ),
@@ -166,7 +166,10 @@ def back_picture(photo: UInt8[np.ndarray, "height width 3"], read: dict[str, Any
 def _further(checked: CaptureCheck) -> str:
     """Return lights, shadows and photos of a further view."""
     pictures = doc.row(
-        doc.figure(coverage(checked.calibration, checked.cover.centre), "Seen from the object: above in the middle"),
+        doc.figure(
+            coverage(checked.calibration, checked.cover.centre),
+            "From the object: overhead is in the middle",
+        ),
         doc.figure(enlarged(shadow_picture(checked.cover), PICTURE_WIDTH), _shadow_caption(checked.cover)),
     )
     return doc.section(checked.name, "Another place of the tripod.", pictures + _photo_table(checked))

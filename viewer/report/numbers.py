@@ -177,7 +177,7 @@ def cost_part(stages: Mapping[str, Mapping[str, Any]]) -> str:
         rows.append(("Together", duration_text(total[0]), f"{total[1]:.1f}", f"{peak / MEGABYTE:,.0f}"))
     return doc.section(
         "Time and memory",
-        "Time on the clock, time that processors were busy (more than the clock if several were), most memory held.",
+        "Time on the clock, time of all processors together, and the most memory held at once.",
         doc.table(("step", "time", "CPU seconds", "memory, MB"), rows, numbers=(1, 2, 3)),
     )
 

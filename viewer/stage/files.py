@@ -42,11 +42,6 @@ class StageFiles:
         self._pack: StagePack | None = None
         self._saved: tuple[tuple[str, ...], tuple[bytes, str]] = ((), (b"", HTML))  # made of what, and the newest
 
-    @property
-    def is_ready(self) -> bool:
-        """Whether the run has left what the stage shows."""
-        return is_finished(self.run_dir)
-
     def get(self, name: str) -> tuple[bytes, str] | None:
         """Return the file of this name, "" for the page, and its media type; None where there is none.
 
@@ -64,7 +59,7 @@ class StageFiles:
 
     def _saved_as(self, kind: str) -> tuple[bytes, str] | None:
         """Return the run as a file of a format, made once for as long as run and notes are the same."""
-        if kind not in FORMATS or not self.is_ready:
+        if kind not in FORMATS or not is_finished(self.run_dir):
             return None
         with self._saving, tempfile.TemporaryDirectory() as folder:
             paths = [self.run_dir / name for name in (MESH, FIELDS, STAGE)]
@@ -78,7 +73,7 @@ class StageFiles:
     def warm(self) -> None:
         """Pack the scene now, so that the first visitor does not wait for it; does nothing before the run is over."""
         try:
-            if self.is_ready:
+            if is_finished(self.run_dir):
                 self.get("")
         except UserError:
             return  # the visitor gets the sentence

@@ -116,11 +116,7 @@ class StudioFolder:
         Raises:
             CaptureError: there is none.
         """
-        path = self.captures().get(key)
-        if path is None:
-            kind = "a run, a capture was needed" if key in self.runs() else "no capture here; it was moved or deleted"
-            raise CaptureError(f"{key[:80]!r} is {kind}. Go back to all captures.")
-        return path
+        return _found(key, self.captures(), "capture", self.runs(), "run")
 
     def run(self, key: str) -> Path:
         """Return the run with this key.
@@ -128,12 +124,7 @@ class StudioFolder:
         Raises:
             CaptureError: there is none.
         """
-        path = self.runs().get(key)
-        if path is None:
-            is_one = key in self.captures()
-            kind = "a capture, a run was needed: start one there" if is_one else "no run here; it was moved or deleted"
-            raise CaptureError(f"{key[:80]!r} is {kind}. Go back to all captures.")
-        return path
+        return _found(key, self.runs(), "run", self.captures(), "capture")
 
     def key(self, path: Path) -> str:
         """Return the path of a capture or run relative to the folder."""
@@ -237,6 +228,13 @@ def is_capture(folder: Path) -> bool:
         return looks_like_capture(folder)
     except (OSError, UserError):
         return False
+
+
+def _found(key: str, places: dict[str, Path], kind: str, others: dict[str, Path], other: str) -> Path:
+    if key in places:
+        return places[key]
+    is_what = f"a {other}, a {kind} was needed" if key in others else f"no {kind} here; it was moved or deleted"
+    raise CaptureError(f"{key[:80]!r} is {is_what}. Go back to all captures.")
 
 
 def _made(path: Path) -> Path:

@@ -1,5 +1,6 @@
 """Library: the cards of the studio's first page, and all that is known of one capture or run."""
 
+import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -23,7 +24,7 @@ from viewer.display.run_follower import PREVIEW, RunFollower, Status, size_text,
 from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder, mark_of, without_folder
 
-PRESETS = ("draft", "standard", "fine", "paper")
+OF_CAPTURE = re.compile(r"(-(draft|standard|fine|paper)(-\d+)?)?")  # what a run's name has behind its capture's
 MOST_DOCUMENTS = 1000  # of runs, that stay in memory
 ARRIVING_S = 4.0  # after the last photo, the capture still counts as arriving
 
@@ -55,7 +56,7 @@ class Library:
                 rows[key] = self.run_row(key, path, job)
         cards = []
         for key, path in captures.items():
-            mine = [name for name, row in rows.items() if self._belongs(path, self.folder.root / name, row, asked)]
+            mine = [name for name in rows if self._belongs(path, self.folder.root / name, asked)]
             own = sorted((rows.pop(name) for name in mine), key=lambda row: -row["date"])
             cards.append(self._card(key, path, own))
         for key, row in rows.items():
@@ -160,14 +161,12 @@ class Library:
             "runs": runs,
         }
 
-    def _belongs(self, capture: Path, run: Path, row: dict[str, Any], asked: dict[Path, Job]) -> bool:
+    def _belongs(self, capture: Path, run: Path, asked: dict[Path, Job]) -> bool:
         """Return whether a run is of a capture: as the queue knows, or by the names that studio and command give."""
         job = asked.get(run)
         if job is not None:
             return Path(job.task.capture) == capture
-        stem, _, preset = run.name.partition("-") if "-" in run.name else (run.name, "", "")
-        is_named = run.name == capture.name or (run.name.startswith(f"{capture.name}-") and row["preset"] in run.name)
-        return is_named or (stem == capture.name and preset in PRESETS)
+        return run.name.startswith(capture.name) and OF_CAPTURE.fullmatch(run.name[len(capture.name) :]) is not None
 
 
 def growing_mark(run: Path) -> str:

@@ -7,6 +7,7 @@ import contextlib
 import threading
 import webbrowser
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from anyio import to_thread
@@ -41,66 +42,51 @@ FREE = {"/", "/live", "/join", *(f"/{name}" for name in FILES)}  # what a phone 
 HOST = "127.0.0.1"
 
 
-class PhoneRoutes:
-    """Answers the requests of phones."""
+def phone_app(studio: Studio, phones: Phones) -> ASGIApp:
+    """Return the application of the phones' listeners."""
 
-    def __init__(self, studio: Studio):
-        """Answer for this studio."""
-        self._studio = studio
-        self._phones: Phones
+    def door() -> Door:
+        found = phones.door
+        if found is None:
+            raise CaptureError("Phones are not let in any more.")
+        return found
 
-    def app(self, phones: Phones) -> ASGIApp:
-        """Return the application of the phones' listeners."""
-        self._phones = phones
-        routes = [
-            *file_routes("phone.html"),
-            Route("/live", self.live, methods=["GET"]),
-            Route("/join", self.join, methods=["POST"]),
-            Route("/api/state", self.state, methods=["GET"]),
-            Route("/api/role", self.role, methods=["POST"]),
-            *Uploads(self._studio.parts, lambda *_: self._door().capture, lambda r: r.state.phone.id).routes(),
-        ]
-        return Gate(
-            Starlette(routes=routes, exception_handlers=sentences(self._studio.folder.root)), EVERYWHERE, self._admits
-        )
-
-    async def live(self, _request: Request) -> Response:
-        """The same page; its address tells it to show the live camera."""
-        return web_file("phone.html")
-
-    async def join(self, request: Request) -> Response:
-        """Let a phone in that shows the code."""
-        values = await read_object(request)
-        phone = self._phones.join(text_of(values, "token"), text_of(values, "name"))
-        answer = JSONResponse({"done": phone.name})
-        answer.set_cookie(COOKIE_NAME, phone.secret, httponly=True, samesite="strict", path="/", max_age=86400)
-        return answer
-
-    async def state(self, request: Request) -> Response:
-        """Say how the capture is doing that the phone sends to."""
-        phone, door = request.state.phone, self._door()
-        found = await to_thread.run_sync(self._studio.for_phone, door.capture)
-        return JSONResponse(found | {"name": phone.name, "role": phone.role, "shots": door.shots})
-
-    async def role(self, request: Request) -> Response:
-        """Note what a phone does in live mode."""
-        values = await read_object(request)
-        self._phones.set_role(request.state.phone, text_of(values, "role"))
-        return JSONResponse({"done": None})
-
-    def _admits(self, request: Request) -> Response | None:
-        if self._phones.door is None:
+    def admits(request: Request) -> Response | None:
+        if phones.door is None:
             return PlainTextResponse("Phones are not let in at the moment.\n", 403)
-        request.state.phone = self._phones.find(request.cookies.get(COOKIE_NAME, ""))
+        request.state.phone = phones.find(request.cookies.get(COOKIE_NAME, ""))
         if request.url.path in FREE or request.state.phone is not None:
             return None
         return JSONResponse({"error": "This phone is not in. Scan the new code that the studio shows."}, 401)
 
-    def _door(self) -> Door:
-        door = self._phones.door
-        if door is None:
-            raise CaptureError("Phones are not let in any more.")
-        return door
+    async def live(_request: Request) -> Response:  # the same page; its address tells it to show the live camera
+        return web_file("phone.html")
+
+    async def join(request: Request) -> Response:
+        values = await read_object(request)
+        phone = phones.join(text_of(values, "token"), text_of(values, "name"))
+        answer = JSONResponse({"done": phone.name})
+        answer.set_cookie(COOKIE_NAME, phone.secret, httponly=True, samesite="strict", path="/", max_age=86400)
+        return answer
+
+    async def state(request: Request) -> Response:
+        phone, now = request.state.phone, door()
+        found = await to_thread.run_sync(studio.for_phone, now.capture)
+        return JSONResponse(found | {"name": phone.name, "role": phone.role, "shots": now.shots})
+
+    async def role(request: Request) -> Response:
+        phones.set_role(request.state.phone, text_of(await read_object(request), "role"))
+        return JSONResponse({"done": None})
+
+    routes = [
+        *file_routes("phone.html"),
+        Route("/live", live, methods=["GET"]),
+        Route("/join", join, methods=["POST"]),
+        Route("/api/state", state, methods=["GET"]),
+        Route("/api/role", role, methods=["POST"]),
+        *Uploads(studio.parts, lambda *_: door().capture, lambda request: request.state.phone.id).routes(),
+    ]
+    return Gate(Starlette(routes=routes, exception_handlers=sentences(studio.folder.root)), EVERYWHERE, admits)
 
 
 def serve(
@@ -135,7 +121,7 @@ def serve(
     with contextlib.ExitStack() as ending:
         ending.callback(folder.release)
         studio = Studio(folder)
-        phones = Phones(folder.kept / "phones.json", folder.kept / "phones", PhoneRoutes(studio).app)
+        phones = Phones(folder.kept / "phones.json", folder.kept / "phones", partial(phone_app, studio))
         token, listener = folder.token(), ending.enter_context(free_socket(HOST, port))
         address = f"http://localhost:{listener.getsockname()[1]}/?token={token}"
         folder.note_address(address)

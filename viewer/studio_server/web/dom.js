@@ -94,7 +94,7 @@ export function toast(words, isBad = false) {
 }
 
 const NOTHING = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="; // without an address a browser draws a broken picture
-const PAUSE_MS = 600, SLOWER_MS = 2000, TRIES = 20; // between two looks whether a picture is made; so many are quick
+const PAUSE_MS = 600, LONGER_MS = 50, TRIES = 100; // until it is asked for anew, longer each time; some minutes in all
 
 /** A picture that may still have to be made; its place stays empty until then. */
 export function picture(address, words, className = "picture") {
@@ -102,7 +102,7 @@ export function picture(address, words, className = "picture") {
   const load = () => { if (image.isConnected || !tries) image.src = address; };
   const image = h("img", { loading: "lazy", class: className, alt: words, key: address, onerror: () => {
     image.src = NOTHING;
-    setTimeout(load, ++tries < TRIES ? PAUSE_MS : SLOWER_MS);
+    if (++tries < TRIES) setTimeout(load, PAUSE_MS + LONGER_MS * tries);
   } });
   image.stays = true;
   load();
