@@ -95,7 +95,8 @@ class Page:
         return time.monotonic() - self._sent >= max(MIN_INTERVAL_S, COST_FACTOR * self._cost_s)
 
     def _begin_sending(self) -> None:
-        self._sent, self._cpu_s, self._cost_s = time.monotonic(), time.process_time(), None
+        if self._cost_s is not None:  # else what goes with this is being sent already
+            self._sent, self._cpu_s, self._cost_s = time.monotonic(), time.process_time(), None
 
     def refresh(self) -> None:
         """Read the folder once and show what is new."""

@@ -6,13 +6,12 @@ from pathlib import Path
 
 from capture.errors import UserError
 from capture.files.regular import read_regular
-from capture.files.title import title_of
 from reconstruct.export.export import as_one_file, default_file, export
 from reconstruct.export.formats import FORMATS
-from reconstruct.stored_run.stage_document import STAGE, read_stage_document
+from reconstruct.stored_run.stage_document import STAGE
 from reconstruct.stored_run.stage_pack import StagePack
 from reconstruct.stored_run.stored_run import FIELDS, MESH
-from viewer.stage.page import is_finished, page_html, stage_pack
+from viewer.stage.page import is_finished, page_of, stage_pack
 
 SAVE = "save/"  # and the name of a format: the run as a file of that kind
 HTML, ZIP, BINARY = "text/html; charset=utf-8", "application/zip", "application/octet-stream"
@@ -54,8 +53,7 @@ class StageFiles:
             return None
         with self._lock:
             self._pack = stage_pack(self.run_dir, self._pack)
-        document = read_stage_document(self.run_dir)
-        return page_html(title_of(self.run_dir), self._pack, document, "socket", "/").encode(), HTML
+        return page_of(self.run_dir, self._pack, "socket", "/").encode(), HTML
 
     def _saved_as(self, kind: str) -> tuple[bytes, str] | None:
         """Return the run as a file of a format, made once for as long as run and notes are the same."""

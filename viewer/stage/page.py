@@ -117,7 +117,16 @@ def stage_page(run_dir: Path, on_progress: OnProgress = lambda done, total, mess
     on_progress(0, 2, "packing the scene")
     pack = stage_pack(run_dir)
     on_progress(1, 2, "writing the page")
-    return page_html(title_of(run_dir), pack, read_stage_document(run_dir))
+    return page_of(run_dir, pack)
+
+
+def page_of(run_dir: Path, pack: StagePack, saves: str = "", home: str = "") -> str:
+    """Return the page of a run, whose packed stage this is, with its title and document; see `page_html`.
+
+    Raises:
+        UserError: the document cannot be used.
+    """
+    return page_html(title_of(run_dir), pack, read_stage_document(run_dir), saves, home)
 
 
 def page_html(

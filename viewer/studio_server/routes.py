@@ -17,10 +17,9 @@ from calibration.board.board import parse_print
 from calibration.board.printing import DEFAULT_BOARDS, PAPERS, BoardPage, draw_pdf, lay_out
 from capture.errors import CaptureError
 from capture.files.regular import is_regular, read_regular
-from capture.files.title import title_of
-from reconstruct.stored_run.stage_document import read_stage_document, save_stage_document
+from reconstruct.stored_run.stage_document import save_stage_document
 from viewer.stage.files import HEADERS, HTML
-from viewer.stage.page import page_html, page_policy
+from viewer.stage.page import page_of, page_policy
 from viewer.studio.example import example_page
 from viewer.studio.studio import Studio
 from viewer.studio_server.gate import FRAMED_POLICY, file_routes, read_body, read_object, sentences, text_of
@@ -133,8 +132,7 @@ def _stage(studio: Studio, request: Request) -> Response:
     if request.method == "HEAD":
         return Response()
     run = studio.folder.run(request.path_params["key"])
-    page = page_html(title_of(run), pack, read_stage_document(run), "frame")
-    return Response(page, media_type=HTML, headers=STAGED)
+    return Response(page_of(run, pack, "frame"), media_type=HTML, headers=STAGED)
 
 
 def _example() -> Response:

@@ -97,10 +97,10 @@ const NOTHING = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAA
 const PAUSE_MS = 600, LONGER_MS = 50, TRIES = 100; // until it is asked for anew, longer each time; some minutes in all
 
 /** A picture that may still have to be made; its place stays empty until then. */
-export function picture(address, words, className = "picture") {
+export function picture(address, words) {
   let tries = 0;
   const load = () => { if (image.isConnected || !tries) image.src = address; };
-  const image = h("img", { loading: "lazy", class: className, alt: words, key: address, onerror: () => {
+  const image = h("img", { loading: "lazy", class: "picture", alt: words, key: address, onerror: () => {
     image.src = NOTHING;
     if (++tries < TRIES) setTimeout(load, PAUSE_MS + LONGER_MS * tries);
   } });
@@ -110,13 +110,13 @@ export function picture(address, words, className = "picture") {
 }
 
 /** Ask in a dialog; resolves to the text, to true where none is asked for, or to null. */
-export function dialog(title, words, action, { text = null, isDanger = false, body = null } = {}) {
+export function dialog(title, words, action, { text = null, isDanger = false } = {}) {
   return new Promise((resolve) => {
     const field = text === null ? null : h("input", { type: "text", value: text, "aria-label": title, maxlength: "120" });
     const done = (value) => { box.close(); box.remove(); resolve(value); };
     const submit = () => done(field ? field.value : true);
     const box = h("dialog", { "aria-label": title, oncancel: () => done(null) },
-      h("h2", {}, title), words && h("p", {}, words), body, field,
+      h("h2", {}, title), words && h("p", {}, words), field,
       h("div", { class: "bar" }, h("button", { onclick: () => done(null) }, "Cancel"),
         h("button", { class: isDanger ? "danger" : "main", onclick: submit }, action)));
     if (field) field.onkeydown = (event) => {
