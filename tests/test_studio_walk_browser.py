@@ -76,7 +76,7 @@ def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp
         save_for_printing(tab)
         look("saved")
         tab.click("text=All captures")
-        wait_until(tab, lambda: tab.evaluate("document.querySelector('.card .picture').naturalWidth > 1"))
+        wait_until(tab, lambda: tab.evaluate("document.querySelector('.card .picture')?.naturalWidth > 1"))
         look("home-again")
         assert not bad
 
