@@ -8,15 +8,14 @@ from pathlib import Path
 
 from reconstruct.stored_run.stage_pack import stage_archive
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.stage.parts import StageParts
+from viewer.stage.parts import facts_and_parts
 from viewer.studio.example import RESULT
 
 
 def main() -> None:
     """Write it for the run that is named."""
     run = Path(sys.argv[1])
-    stage = StageParts(StoredRun(run))
-    facts, parts = stage.facts(), stage.all()
+    facts, parts = facts_and_parts(StoredRun(run))
     for name in facts["addresses"]["photos"].values():
         parts.pop(name)
     facts["addresses"]["photos"] = {}

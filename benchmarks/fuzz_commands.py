@@ -19,8 +19,7 @@ from capture.intake.parts import Parts
 from reconstruct.export.export import ExportOptions, export
 from reconstruct.run.queue import Queue
 from viewer.page.guard import GuardedServer
-from viewer.stage.pack_file import stage_pack
-from viewer.stage.page import stage_page
+from viewer.stage.page import stage_pack, stage_page
 from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder
 from viewer.studio.helper import Helper

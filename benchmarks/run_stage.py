@@ -108,7 +108,7 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("run", type=Path, help="the folder of a finished run")
     asked = parser.parse_args()
-    files = StageFiles(asked.run, "socket")
+    files = StageFiles(asked.run)
     files.warm()
     server = GuardedServer("127.0.0.1", 0, files)
     path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))

@@ -27,7 +27,6 @@ from shadowgraph.options import Calibrate, Check, Doctor, Evaluate, Import, Prin
 from shadowgraph.run_command import Batch, batch, check, folder_name, run_stages
 from shadowgraph.studio_command import Studio, Watch, studio, watch
 from shadowgraph.terminal import print_lines
-from viewer.studio.words import in_page_words
 
 OPTIONS = {
     Remedy.NAME_BOARD: "--board",
@@ -82,6 +81,8 @@ def say_fault(kind: type[BaseException], error: BaseException, trace: TracebackT
 def _in_words(error: UserError) -> str:
     """Return the text of an error with what to do as options, or as buttons of the studio that started this process."""
     if os.environ.get(FOR_STUDIO) == "1":
+        from viewer.studio.helper import in_page_words
+
         return in_page_words(error)
     return error.worded(lambda one: f"{one.value} ({OPTIONS[one]})" if one in OPTIONS else one.value)
 

@@ -18,7 +18,7 @@ from reconstruct.run_folder.progress import progress
 from reconstruct.stored_run.refusal import refuse_no_run
 from shadowgraph.options import Command, Given, ResultFolder
 from shadowgraph.terminal import Display, print_lines
-from viewer.report.formats import FORMATS
+from viewer.stage.page import FORMATS
 
 FORMAT_NAMES = ", ".join(FORMATS)
 

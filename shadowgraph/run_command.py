@@ -199,7 +199,7 @@ def _print_result(out: Path, console: Console) -> None:
 
 def _write_report(run: RunFolder) -> None:
     from viewer.report.report import write_report
-    from viewer.stage.pack_file import write_stage
+    from viewer.stage.page import write_stage
 
     with run.stage("report", "writing report.html and the page's picture"):
         write_report(run.path)

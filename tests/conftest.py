@@ -199,7 +199,7 @@ def finished_run(request) -> Callable[..., Path]:
         import fake_run
 
         from reconstruct.mesh.mesh import extract_mesh, save_mesh
-        from viewer.stage.pack_file import write_stage
+        from viewer.stage.page import write_stage
 
         truth, run = request.getfixturevalue("truth"), top / "heap"
         fake_run.start_run(run, truth)

@@ -33,7 +33,7 @@ from reconstruct.detail.surface import Window
 from reconstruct.fields import FurtherView, SolvedScene, Verdict, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
 from reconstruct.solve.checkpoint import write_checkpoint
-from viewer.stage.pack_file import write_stage
+from viewer.stage.page import write_stage
 
 TENSORS = ("fields.safetensors", "detail.safetensors", "checkpoint.safetensors")
 MAPS = ("depth.npy", "normal.npy")

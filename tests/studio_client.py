@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
@@ -16,12 +17,11 @@ from test_queue import PROGRAM
 from waiting import PATIENCE_S, wait_until
 
 from viewer.studio.folder import StudioFolder
-from viewer.studio.sockets import free_socket, http_server
 from viewer.studio.studio import Studio
-from viewer.studio_server.gate import Gate, OwnerSecret
+from viewer.studio_server.gate import Gate, OwnerSecret, free_socket, http_server
 from viewer.studio_server.phones import Phones
 from viewer.studio_server.routes import owner_app
-from viewer.studio_server.serve import PhoneRoutes
+from viewer.studio_server.serve import phone_app
 
 ROOT = Path(__file__).parent.parent
 
@@ -82,7 +82,7 @@ def served(folder: Path, program: tuple[str, ...] = (), port: int = 0, run_s: st
     kept = StudioFolder(folder)
     (kept.kept / "program.py").write_text(PROGRAM.replace("sys.argv[7]", repr(run_s)))
     studio = Studio(kept, program or (sys.executable, str(kept.kept / "program.py")))
-    phones = Phones(kept.kept / "phones.json", kept.kept / "phones", PhoneRoutes(studio).app)
+    phones = Phones(kept.kept / "phones.json", kept.kept / "phones", partial(phone_app, studio))
     token, listener = kept.token(), free_socket("127.0.0.1", port)
     port = listener.getsockname()[1]
     server = http_server(Gate(owner_app(studio, phones), "127.0.0.1", OwnerSecret(token)))

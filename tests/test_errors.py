@@ -11,7 +11,7 @@ from PIL import Image
 from capture.errors import FOR_STUDIO, CaptureError, Remedy, UserError
 from capture.files.atomic import write_json
 from shadowgraph.command import OPTIONS, main, sentence_for
-from viewer.studio.words import in_page_words
+from viewer.studio.helper import in_page_words
 
 ROOT = Path(__file__).parent.parent
 OPTION = re.compile(r"(?<![\w-])--[a-z]{3}|`shadowgraph ")

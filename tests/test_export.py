@@ -20,7 +20,7 @@ from reconstruct.export import maps
 from reconstruct.export.export import ExportOptions, _imported, export
 from reconstruct.mesh.simplify import bounds_a_solid
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.report.formats import FORMATS
+from viewer.stage.page import FORMATS
 
 SMALL = ExportOptions(faces=800, texture=128, width=160, frames=3, lamp_size=0.0)
 

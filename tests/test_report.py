@@ -230,19 +230,8 @@ def test_each_picture_of_the_mesh_says_how_much_of_what_it_shows_is_known():
     assert "seen in the photos" not in mesh_pictures(ball, None)
 
 
-def test_the_report_tells_how_far_each_light_moved_and_why_it_was_kept(truth):
-    calibration = replace(truth.calibration, lights=truth.calibration.lights[:4])
-    rows = [
-        {
-            "photo": x.photo,
-            "position": x.homogeneous()[:3] + np.array([by, 0, 0]),
-            "moved": by,
-            "sigma": [5.0] * 3,
-            "sigmas": by,
-        }
-        for by, x in enumerate(calibration.lights, 1)
-    ]
+def test_the_report_tells_how_far_lights_moved_and_why_that_was_kept():
     trial = {"accepted": True, "sentence": "refined lights decided upon", "noise": 0.1}
-    page = refinement_part({"refined_lights": rows, "light_trial": trial}, calibration, None)
-    assert "Refined lights decided upon." in page and calibration.lights[3].photo in page
-    assert "<td" in page and "2.5" in page  # the median
+    page = refinement_part({"refined_lights": [{"sigmas": by} for by in (1, 2, 3, 4)], "light_trial": trial})
+    assert "Refined lights decided upon." in page and "less than 2.50 times" in page
+    assert "times" not in refinement_part({"light_trial": trial | {"accepted": False}})

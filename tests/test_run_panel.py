@@ -44,7 +44,7 @@ def test_each_button_makes_its_request_and_the_page_says_what_becomes_of_it(page
     fake_run.log_line(tmp_path, 50.0, "solve", 36, 120, f"{PAUSED}go on with the button")
     page.refresh()
     assert "Paused while fitting the surface" in page.controls._status.content
-    assert "waits until somebody goes on" in page.controls._status.content
+    assert "Press Go on" in page.controls._status.content
     press(run._go_on)
     press(run._next)
     press(run._stop)

@@ -6,14 +6,15 @@ import torch
 from fake_run import fields_of, mesh_of
 from stage_runs import SHAPES, stage_run, truth_of
 
+from reconstruct.export.stage_scene import stage_scene
 from reconstruct.render.g_buffer import albedo_at, seen_material
 from reconstruct.render.radiosity import find_patches, nearest_patches
 from reconstruct.render.receivers import Receivers
 from reconstruct.render.soft_light import soft_light
-from reconstruct.render.studio import towards
+from reconstruct.render.studio import direction_of, studio_of, towards
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.stage.facts import home_view
-from viewer.stage.parts import StageParts
+from viewer.stage.facts import home_pose
+from viewer.stage.parts import first_view
 
 
 @pytest.fixture(scope="module", params=list(SHAPES))
@@ -54,8 +55,10 @@ def test_four_numbers_tell_the_bounce_of_lamps_from_all_sides(scene):
 
 @pytest.mark.parametrize("name", list(SHAPES))
 def test_the_first_lamp_stands_high_and_aside_and_shows_more_than_one_at_the_camera(name, tmp_path):
-    parts = StageParts(StoredRun(stage_run(tmp_path, name)))
-    view, camera = parts.first, home_view(parts.run.fields, parts.studio)["azimuth"]
+    run = StoredRun(stage_run(tmp_path, name))
+    studio = studio_of(np.asarray(run.mesh.bounds))
+    view = first_view(run, studio, stage_scene(run))
+    camera = direction_of(home_pose(run.fields, studio).translation - studio.centre)[0]
     azimuth, elevation = view.lamp
     assert 34 < np.degrees(elevation) < 66 and 29 < abs(np.degrees(azimuth - camera)) < 61
     assert view.entropy(azimuth, elevation) > view.entropy(camera, elevation)

@@ -25,8 +25,8 @@ from reconstruct.render.relight import lit_share, relight
 from reconstruct.render.studio import FOCAL_HEIGHTS, looking_at, studio_of, towards
 from reconstruct.stored_run.stage_document import EMPTY, save_stage_document
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.report.formats import FORMATS
 from viewer.stage import page as stage_page_module
+from viewer.stage.page import FORMATS
 
 WIDTH, HEIGHT = 320, 240
 VIEW = {"azimuth": -1.2, "elevation": 0.7, "distance": 420.0, "focal": FOCAL_HEIGHTS, "shift": [0, 0]}
@@ -137,7 +137,7 @@ def test_a_place_that_is_tapped_says_which_view_shows_it(tab, ours):
     behind = tab.evaluate("shadowgraph.state().view.azimuth") + np.pi
     stage_picture(tab, view={"azimuth": behind, "elevation": 0.2}, lamp=LAMP)
     tab.keyboard.press("Enter")  # the cross is in the middle
-    assert tab.locator("#hint").inner_text() == "None of 1 view shows this place."
+    assert tab.locator("#hint").inner_text() == "No photo shows this place."
     tab.keyboard.press("Escape")
 
 

@@ -36,7 +36,7 @@ from reconstruct.stored_run.stored_run import StoredRun
 from reconstruct.tensor_file import Layout, read_tensors, write_tensors
 from viewer.display.run_follower import RunFollower, status
 from viewer.report.report import read_results, write_report
-from viewer.stage.pack_file import stored_stage
+from viewer.stage.page import kept_pack
 
 ROOT = Path(__file__).parent.parent
 READERS = ("fields", "detail", "calibration", "views", "mesh", "maps", "report", "manifest")
@@ -106,12 +106,12 @@ def test_a_damaged_run_is_read_or_refused_in_sentences(whole, tmp_path_factory, 
 
 
 def test_a_packed_stage_is_whole_or_counts_as_none(run):
-    assert stored_stage(run) is not None
+    assert kept_pack(run) is not None
     content = (run / "stage.zip").read_bytes()
     said = set()
     for seed in range(30):
         said.add(strange_runs.by_archive(random.Random(seed), run))
-        pack = stored_stage(run)
+        pack = kept_pack(run)
         assert pack is None or all(isinstance(pack.read(name), bytes) for name in pack.names)
         (run / "stage.zip").write_bytes(content)
     assert len(said) == 10

@@ -60,7 +60,7 @@ def test_captures_and_their_runs_are_cards_with_what_is_known_of_them(folder):
     assert runs.keys() == {"runs/vase", "runs/vase-fine"}
     run, stopped = runs["runs/vase"], runs["runs/vase-fine"]
     known = [run[name] for name in ("state", "size", "preset", "verdict")]
-    assert known == ["finished", [93.0, 113.4, 120.3], "draft", "good"]
+    assert known == ["finished", "93.0 \N{MULTIPLICATION SIGN} 113.4 \N{MULTIPLICATION SIGN} 120.3 mm", "draft", "good"]
     assert run["guessed"] == 0.33 and run["warnings"] == ["a remark"]
     assert stopped["state"] == "stopped" and "Stopped while" in stopped["sentence"]
     assert cards["captures/cup"]["count"] == 6 and state["free"] > 0
@@ -119,7 +119,7 @@ MISTAKES = (
     ("/report?key=vase", "is a capture, a run was needed"),
     ("/api/capture?key=../vase", "no capture here"),
     ("/api/capture?key=/etc", "no capture here"),
-    ("/stage/runs/broken/", "no result yet"),
+    ("/stage/runs/broken/", "no finished run yet"),
     ("/api/folders?key=../..", "no folder below"),
     ("/board.pdf?board=nonsense", "board"),
     ("/board.pdf?paper=a0", "is no paper"),
@@ -145,7 +145,7 @@ def test_a_run_whose_files_are_damaged_is_a_card_all_the_same(folder):
     (run / "manifest.json").symlink_to("/etc/passwd")
     with served(folder) as (_, _, owner):
         (card,) = owner.get("/api/state")[1]["cards"]
-    assert card["runs"][0]["state"] == "finished" and card["runs"][0]["size"] is None
+    assert card["runs"][0]["state"] == "finished" and card["runs"][0]["size"] == ""
 
 
 def test_a_second_studio_of_the_same_folder_leads_to_the_first(folder):

@@ -17,11 +17,10 @@ from test_intake import jpeg
 from test_studio import capture_in, run_in
 from waiting import wait_until
 
-from viewer.studio import sockets
 from viewer.studio_server import gate, phones
 from viewer.studio_server.gate import WEB
 from viewer.studio_server.routes import owner_app
-from viewer.studio_server.serve import PhoneRoutes
+from viewer.studio_server.serve import phone_app
 
 LOCAL_STYLE = re.compile(r"\bstyle\s*=|<style|javascript:|\bon\w+\s*=\s*[\"']", re.IGNORECASE)
 
@@ -128,7 +127,7 @@ STRANGE = {
     "a list": [["a"]],
     "an object": {"a": {}},
 }
-UNTRIED = ("/api/leave", "/api/send_away", "/api/try_example")  # others would be refused then; it copies 45 photos
+UNTRIED = ("/api/send_away", "/api/try_example")  # others would be refused then; it copies 45 photos
 NAMES = ("key", "title", "photo", "part", "id", "board", "role", "preset", "job", "action", "format", "size", "paper")
 NAMES += ("token", "name", "capture")
 
@@ -139,7 +138,7 @@ def test_no_value_of_a_request_is_a_fault_of_the_program_at_any_address(let_in, 
     door, owner, port, token = let_in
     phone = joined(port, token)
     studio = open_studio[0]
-    everybody = (phone, PhoneRoutes(studio).app(door)._app), (owner, owner_app(studio, door))
+    everybody = (phone, phone_app(studio, door)._app), (owner, owner_app(studio, door))
     words = quote(str(value), errors="surrogateescape" if value == "\udcff" else "surrogatepass")
     query = "&".join(f"{name}={words}" for name in ("key", "photo", "board", "paper", "format", "size", "token"))
     headers = {"Upload-Length": words, "Upload-Metadata": f"filename {words}", "Upload-Offset": words}
@@ -224,7 +223,7 @@ def test_a_phone_sends_to_the_capture_of_its_door_alone_and_reaches_nothing_else
     assert phone.send("secret", "phone.jpg", jpeg(9)).status == 204
     names = {key: [p["name"] for p in owner.get(f"/api/capture?key={key}")[1]["photos"]] for key in ("vase", "secret")}
     assert "photos/phone.jpg" in names["vase"] and "photos/phone.jpg" not in names["secret"]
-    for path in ("/app.js", "/api/capture?key=vase", "/api/phones", "/report?key=runs/vase", "/api/folders"):
+    for path in ("/api/capture?key=vase", "/api/phones", "/report?key=runs/vase", "/api/folders"):
         assert phone.raw("GET", path).status == 404
     assert phone.raw("POST", "/api/delete", b'{"key": "vase"}').status in (404, 405)
     assert phone.raw("POST", "/upload", b"", Origin="http://evil.example").status == 403
@@ -268,7 +267,7 @@ def test_a_full_disk_is_a_sentence_to_a_phone_whose_file_goes_on_once_there_is_r
 
 
 def test_two_programs_that_ask_for_one_port_at_once_get_two():
-    with sockets.free_socket("127.0.0.1", 8600) as one, sockets.free_socket("127.0.0.1", 8600) as other:
+    with gate.free_socket("127.0.0.1", 8600) as one, gate.free_socket("127.0.0.1", 8600) as other:
         assert one.getsockname() != other.getsockname()
 
 

@@ -25,14 +25,9 @@ def folder(finished_run, tmp_path_factory):
 
 
 def made(owner, name: str, size: str = "") -> dict:
-    found: dict = {}
-
-    def is_there() -> bool:
-        found.update(owner.ok("save", key=RUN, format=name, size=size))
-        return bool(found["file"])
-
-    wait_until(is_there)
-    return found
+    owner.ok("save", key=RUN, format=name, size=size)
+    wait_until(lambda: row_of(owner, name).get("share") == 1.0)
+    return row_of(owner, name)
 
 
 def address(name: str, size: str = "") -> str:
@@ -67,26 +62,21 @@ def test_several_files_come_as_one_archive_and_are_forgotten_by_the_next_studio(
         assert not list((folder / ".studio" / "saved").iterdir())
 
 
-REFUSED = (  # format, size, what is said
-    ("stl", "wide", "no number"),
-    ("stl", "0", "no size to print"),
-    ("../x", "", "no kind"),
-    ("3mf", "nan", "size"),
-)
-
-
-def refusal(owner, name: str, size: str) -> tuple:
-    """The first answer that is none of a file under way."""
-    found: list[tuple] = []
-    wait_until(lambda: found.append(owner.post("save", key=RUN, format=name, size=size)) or found[-1][0] != 200)
-    return found[-1]
+REFUSED = (("stl", "wide", "no number"), ("../x", "", "no kind"))  # format, size, what is said at once
+FAILED = (("stl", "0", "no size to print"), ("3mf", "nan", "size"))  # and what, when it was tried
 
 
 def test_what_cannot_be_saved_is_a_sentence(folder):
     with served(folder) as (_, _, owner):  # one for all: its helper takes 3 s to start
         for name, size, said in REFUSED:
-            status, answer = refusal(owner, name, size)
+            status, answer = owner.post("save", key=RUN, format=name, size=size)
             assert status == 400 and said in answer["error"], (name, size)
+        for name, size, said in FAILED:
+            owner.ok("save", key=RUN, format=name, size=size)
+            wait_until(lambda name=name: row_of(owner, name).get("error"))
+            assert said in row_of(owner, name)["error"] and owner.raw("GET", address(name, size)).status == 400
+        owner.ok("save", key=RUN, format="3mf", size="nan")
+        assert not row_of(owner, "3mf")["error"], "asked anew, it is tried again"
 
 
 def row_of(owner, name: str) -> dict:
@@ -96,7 +86,7 @@ def row_of(owner, name: str) -> dict:
 @pytest.mark.slow
 def test_a_video_says_how_far_it_is_lets_others_pass_and_is_cancelled(folder):
     with served(folder) as (studio, _, owner):
-        assert not owner.ok("save", key=RUN, format="turntable", size="")["file"]
+        owner.ok("save", key=RUN, format="turntable", size="")
         wait_until(lambda: (row_of(owner, "turntable").get("share") or 0.0) > 0.0)
         assert made(owner, "stl")["file"] == "heap.stl"
         film = row_of(owner, "turntable")
@@ -109,7 +99,7 @@ def test_a_video_says_how_far_it_is_lets_others_pass_and_is_cancelled(folder):
         wait_until(lambda: len(list((folder / ".studio" / "saved").iterdir())) == 1)  # drafts of the video went, too
         owner.ok("forget_save", key=RUN, format="stl", size="")
         assert not list((folder / ".studio" / "saved").iterdir())
-        assert not owner.ok("save", key=RUN, format="turntable", size="")["file"]
+        owner.ok("save", key=RUN, format="turntable", size="")
         wait_until(lambda: (row_of(owner, "turntable").get("share") or 0.0) > 0.0)  # after a cancelled one
 
 
@@ -122,12 +112,12 @@ def test_a_run_under_way_shows_its_photos_and_then_the_growing_surface(tmp_path,
         for _ in range(2):
             row = owner.get("/api/state")[1]["cards"][0]["runs"][0]
             marks.append(row["growing"])
-            wait_until(lambda: studio.growing.picture("runs/heap") and not studio.growing._pending)
+            wait_until(lambda: studio.growing_picture("runs/heap") and not studio._growing._pending)
             pictures.append(np.asarray(Image.open(io.BytesIO(owner.raw("GET", "/api/growing?key=runs/heap").content))))
-            studio.growing._made.clear()  # as if some seconds had gone
+            studio._growing._answers.clear()  # as if some seconds had gone
             if (run / "later.ply").exists():
                 (run / "later.ply").rename(run / "preview.ply")
-    assert marks[0].startswith("photos") and marks[1].startswith("surface")
+    assert all(marks) and marks[0] != marks[1]
     assert pictures[0].shape == pictures[1].shape == (480, 640, 3)
     assert np.abs(pictures[0].astype(int) - pictures[1]).mean() > 5 and pictures[1].std() > 10
 

@@ -10,9 +10,8 @@ from test_studio_browser import opened
 
 from reconstruct.export.export import export
 from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
-from reconstruct.stored_run.stage_pack import STAGE_PACK
-from viewer.report.formats import FORMATS
-from viewer.stage.files import StageFiles
+from reconstruct.stored_run.stage_pack import STAGE_PACK, StagePack
+from viewer.stage.page import FORMATS
 
 PAGE, DOCUMENT = "/stage/runs/heap/", "/stage/runs/heap/stage.json"
 NOTED = json.dumps(
@@ -54,7 +53,7 @@ def test_a_damaged_pack_or_one_of_another_solve_counts_as_none(studio_folder, tm
     pack, mesh = run / STAGE_PACK, run / "mesh.ply"
     whole, surface = pack.read_bytes(), mesh.read_bytes()
     with served(studio_folder) as (studio, _, _):
-        assert isinstance(studio.stage("runs/heap"), StageFiles)
+        assert isinstance(studio.stage("runs/heap"), StagePack)
         for content in (whole[:-200], whole.replace(b"first.jpg", b"../rs.jpg"), b""):
             pack.write_bytes(content)
             mesh.write_bytes(surface)  # so that the file's time is another

@@ -52,7 +52,7 @@ def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp
         look("running")
         before = tab.inner_text("#clock")
         wait_until(tab, lambda: tab.inner_text("#clock") != before)
-        tab.wait_for_selector("img.growing[src^=blob]")
+        tab.wait_for_selector("img.growing:not([hidden])")
         look("growing")
         tab.click("text=All captures")
         tab.wait_for_selector("section.queue")
@@ -76,7 +76,7 @@ def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp
         save_for_printing(tab)
         look("saved")
         tab.click("text=All captures")
-        tab.wait_for_selector(".card .picture[src^=blob]")
+        wait_until(tab, lambda: tab.evaluate("document.querySelector('.card .picture')?.naturalWidth > 1"))
         look("home-again")
         assert not bad
 

@@ -63,8 +63,8 @@ def test_results_reports_pages_and_files_have_the_title(finished_run, tmp_path):
     assert default_file(run, "glb").stem == as_name(title, "")
     page = StageFiles(run).get("")
     escaped = title.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    assert page is not None and f"<title>{escaped}" in page.content.decode()
-    assert "<cup>" not in page.content.decode()
+    assert page is not None and f"<title>{escaped}" in page[0].decode()
+    assert "<cup>" not in page[0].decode()
 
 
 def test_a_file_to_download_is_called_as_its_run_is_now(finished_run, tmp_path):

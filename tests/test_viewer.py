@@ -1,5 +1,4 @@
 from pathlib import Path
-from types import SimpleNamespace
 
 import fake_run
 import numpy as np
@@ -18,7 +17,7 @@ from viewer.display.layers import (
 )
 from viewer.display.run_follower import RunFollower, loss_curves, size_text, status
 from viewer.page.controls import continued
-from viewer.page.page import MIN_INTERVAL_S, Page, RateLimit
+from viewer.page.page import Page
 
 ROOT = Path(__file__).parent.parent
 
@@ -166,17 +165,3 @@ def test_a_damaged_file_does_not_end_the_page(tmp_path, truth, server):
     page = Page(tmp_path, server)
     page.refresh()
     assert "calibration.json" in page.problem
-
-
-def test_the_first_mesh_is_due_at_once_and_a_cheap_one_every_two_seconds(monkeypatch):
-    now = [100.0, 7.0]  # a clock and an account of CPU seconds
-    monkeypatch.setattr("viewer.page.page.time", SimpleNamespace(monotonic=lambda: now[0], process_time=lambda: now[1]))
-    limit = RateLimit()
-    assert limit.is_due()
-    limit.begin()
-    now[1] += 0.01
-    assert not limit.is_due()
-    now[0] += MIN_INTERVAL_S - 0.1
-    assert not limit.is_due()
-    now[0] += 0.1
-    assert limit.is_due()

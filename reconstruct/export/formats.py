@@ -1,6 +1,6 @@
 """FORMATS: the table of export formats, one row each. reconstruct.export.export writes them.
 
-The row of the single-file page is in viewer/report/numbers.py, where that page is made.
+The row of the single-file page is in viewer/stage/page.py, where that page is made.
 """
 
 from dataclasses import dataclass

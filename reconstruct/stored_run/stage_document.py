@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from capture.errors import CalibrationError
+from capture.errors import CalibrationError, ReconstructionError
 from capture.files.atomic import parse_json, write_json
 from capture.files.regular import why
 from capture.files.schema import Number, as_type, read_as
@@ -94,9 +94,13 @@ def save_stage_document(run_dir: Path, content: bytes) -> None:
 
     Raises:
         CalibrationError: it is none; names the value that is at fault.
-        OSError: it cannot be written.
+        ReconstructionError: the run's folder cannot be written; says why.
     """
-    write_json(run_dir / STAGE, parsed_stage(content))
+    document = parsed_stage(content)
+    try:
+        write_json(run_dir / STAGE, document)
+    except OSError as error:
+        raise ReconstructionError(f"{run_dir / STAGE} cannot be written ({error.strerror or error}).") from error
 
 
 def parsed_stage(content: bytes) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""stage.zip: the page of a finished run as it is served, packed once: what its scripts read, and its parts.
+"""stage.zip: the page of a finished run, packed once: what its scripts read, and its parts.
 
 An archive without compression of `facts.json` and the parts that its "addresses" name. It is made of mesh.ply and the
 solved fields, whose marks it holds: one of another solve counts as none, and so does a damaged one, because it can be
@@ -22,7 +22,7 @@ from capture.files.regular import open_regular, read_regular
 from capture.files.schema import MOST_ENTRIES, Count, Text, as_type, check_numbers
 
 STAGE_PACK, FACTS = "stage.zip", "facts.json"
-FORMAT = 5
+FORMAT = 6
 LARGEST = 1 << 28  # bytes of the archive
 LARGEST_FACTS = 1 << 22
 MOST_PARTS = 4000
@@ -39,7 +39,7 @@ class _Part(Struct):
 
 
 class _Facts(Struct):
-    format: Literal[5]
+    format: Literal[6]
     parts: Annotated[dict[Text, _Part], Meta(max_length=MOST_ENTRIES)]
     size: Text
 
@@ -89,13 +89,13 @@ def _is_plain(entry: zipfile.ZipInfo) -> bool:
     return is_stored and not entry.flag_bits & ~UTF_8
 
 
-def read_stage_pack(run_dir: Path, path: Path) -> StagePack | None:
-    """Return the archive at `path` if it is whole and of this run's results; else None.
+def read_stage_pack(run_dir: Path) -> StagePack | None:
+    """Return the archive of a run if it is whole and of the run's results; else None.
 
     Raises:
         OSError: the run has no results.
     """
-    marks, pack = marks_of(run_dir), opened_pack(path)
+    marks, pack = marks_of(run_dir), opened_pack(run_dir / STAGE_PACK)
     return pack if pack is not None and pack.facts.get("madeOf") == marks else None
 
 
@@ -148,12 +148,9 @@ def addressed(facts: Mapping[str, Any], addresses: Mapping[str, str]) -> dict[st
     Raises:
         KeyError, TypeError, AttributeError: a part is named that is not there, or something else.
     """
-    named, tiles = facts["addresses"], facts["addresses"].get("tiles")
+    named = facts["addresses"]
     found: dict[str, Any] = {name: addresses[named[name]] for name in ("block", "object", "ground", "first")}
-    found["normals"] = None if named.get("normals") is None else addresses[named["normals"]]
+    for name in ("normals", "fine", "fineNormals"):
+        found[name] = None if named.get(name) is None else addresses[named[name]]
     found["photos"] = {str(photo): addresses[name] for photo, name in named["photos"].items()}
-    found["tiles"] = None
-    if tiles is not None:
-        places = {kind: [addresses[name] for name in tiles[kind]] for kind in ("albedo", "normals")}
-        found["tiles"] = {"side": int(tiles["side"]), "size": [int(n) for n in tiles["size"]], **places}
     return {**facts, "addresses": found}

@@ -38,8 +38,11 @@ MOST_FACES = 400_000  # above this a mesh is simplified for the page only: 12 MB
 FIRST_FOV = float(np.radians(55.0))  # vertical
 RAISED = 0.58  # of half the height of an upright window: how far above its middle the object is shown
 FRAMED = 0.75  # of the window's shorter side, by the sphere around a finished object
-FIRST_TURN = np.radians(42.0)  # the first view stands beside the camera: it is seen, not seen through
-FIRST_FARTHEST = 1.7 * CAMERA_DISTANCE  # farther away the object would be too small; then some lights are out of view
+FIRST_TURN, FLATTER = np.radians(42.0), (1.0, 1.0, 0.6)  # the first view stands beside the camera, lower: it is seen
+FIRST_FARTHEST, FIRST_RAISED = (
+    1.7 * CAMERA_DISTANCE,
+    0.3 * CAMERA_DISTANCE,
+)  # shows most lights; farther, the object is small
 
 AMBER, GREY, CHOSEN, PLAIN = (255, 184, 77), (120, 124, 134), (255, 92, 56), (196, 200, 208)
 
@@ -79,19 +82,16 @@ def light_position(light: Light, scale: PageScale) -> Float[np.ndarray, "3"]:
 
 
 def first_view(calibration: Calibration, scale: PageScale) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Choose eye and target on the page, so that camera, object and as many lights as fit are in view."""
-    centre = scale.to_page(scale.centre)
-    eye = scale.to_page(calibration.world_from_camera.translation)
-    x, y, z = (eye - centre) / np.linalg.norm(eye - centre)
-    c, s = np.cos(FIRST_TURN), np.sin(FIRST_TURN)
-    back = np.array([c * x - s * y, s * x + c * y, max(0.6 * z, 0.3)])
-    back /= np.linalg.norm(back)
-    shown = np.array([eye, *(light_position(light, scale) for light in calibration.lights if light.used)])
-    target = centre + np.array([0, 0, 0.35 * np.clip(np.median(shown[:, 2]) - centre[2], 0, CAMERA_DISTANCE)])
-    along = (shown - target) @ back
-    aside = np.linalg.norm(shown - target - along[:, None] * back, axis=1)
-    needed = (along + aside / np.tan(0.5 * FIRST_FOV)).max()
-    return target + back * np.clip(needed, 0.8 * CAMERA_DISTANCE, FIRST_FARTHEST), target
+    """Choose eye and target on the page, so that camera, ground and most lights are in view."""
+    target = scale.to_page(scale.centre) + np.array([0.0, 0.0, FIRST_RAISED])
+    back = _beside((calibration.world_from_camera.translation - scale.centre) * FLATTER, FIRST_TURN)
+    return target + back * FIRST_FARTHEST, target
+
+
+def _beside(way: Float[np.ndarray, "3"], turn: float) -> Float[np.ndarray, "3"]:
+    """Return the unit vector of a direction that was turned about the vertical, rad."""
+    c, s = np.cos(turn), np.sin(turn)
+    return np.array([c * way[0] - s * way[1], s * way[0] + c * way[1], way[2]]) / np.linalg.norm(way)
 
 
 def framed_view(
@@ -107,15 +107,11 @@ def framed_view(
     """
     low, high = scale.to_page(bounds)
     target, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
-    back = scale.to_page(calibration.world_from_camera.translation) - target
-    c, s = np.cos(0.5 * FIRST_TURN), np.sin(0.5 * FIRST_TURN)
-    back = np.array([c * back[0] - s * back[1], s * back[0] + c * back[1], back[2]]) / np.linalg.norm(back)
-    half_angle = np.arctan(FRAMED * np.tan(0.5 * FIRST_FOV) * min(1.0, aspect))
-    distance = radius / np.sin(half_angle)
+    back = _beside(scale.to_page(calibration.world_from_camera.translation) - target, 0.5 * FIRST_TURN)
+    distance = radius / np.sin(np.arctan(FRAMED * np.tan(0.5 * FIRST_FOV) * min(1.0, aspect)))
     if aspect < 1:
-        aside = np.cross([0.0, 0.0, 1.0], back)
-        up = np.cross(back, aside / max(float(np.linalg.norm(aside)), 1e-9))
-        target = target - up * RAISED * distance * np.tan(0.5 * FIRST_FOV)
+        up = np.array([0.0, 0.0, 1.0]) - back[2] * back  # on the picture
+        target = target - up / max(float(np.linalg.norm(up)), 1e-9) * RAISED * distance * np.tan(0.5 * FIRST_FOV)
     return target + back * distance, target
 
 

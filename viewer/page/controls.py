@@ -35,9 +35,7 @@ ASKED = {
     PAUSE: "a pause",
     NEXT_LEVEL: "to go on finer",
     STOP: "stop and save",
-    "draft": "draft from the next round on",
-    "standard": "standard from the next round on",
-    "fine": "fine from the next round on",
+    **{name: f"{name} from the next round on" for name in RESOLUTIONS},
 }
 HINTS = {
     PAUSE: "The run waits and uses no processor; Go on continues it",
@@ -120,12 +118,12 @@ def _answer(now: Status, log: Sequence[Mapping[str, Any]], asked: frozenset[str]
         return f"Nothing runs in this folder. The same command goes on where it stopped.{left}"
     last = log[-1] if log else {}
     if str(last.get("message", "")).startswith(PAUSED):
-        return "Paused. It waits until somebody goes on, here or by starting the same command again."
+        return "Paused. Press Go on, or start the same command again."
     open_ones = [words for name, words in ASKED.items() if name in asked]
     if not open_ones:
         return ""
     when = "in a moment" if str(last.get("stage", "")) in SOLVING else "once the surface is being fitted"
-    return f"Asked for: {', '.join(open_ones)}. It follows {when}."
+    return f"Asked for: {', '.join(open_ones)}. It takes effect {when}."
 
 
 class Controls:

@@ -34,7 +34,8 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from capture.errors import UserError
-from viewer.stage.files import HEADERS, HTML, SAFE_HEADERS, StageFile, StageFiles
+from reconstruct.stored_run.stage_document import save_stage_document
+from viewer.stage.files import HEADERS, HTML, SAFE_HEADERS, StageFiles
 
 LARGEST = 1 << 16  # bytes of one message: decoded, it may need a hundred times its size
 VALUE = "GuiUpdateMessage"  # a control was moved or pressed
@@ -50,7 +51,7 @@ PAGE = ("/", "/index.html")  # viser's page is one file
 STAGE, STAGE_DOCUMENT = "/stage/", "/stage/stage.json"  # the run as a picture, beside viser's page
 PACKING_S = 6.0  # seconds that a request waits for a run's picture to be packed
 PACKING = (
-    b'<!doctype html><meta http-equiv="refresh" content="2"><title>Shadowgraph</title><p>The picture is being packed.'
+    b'<!doctype html><meta http-equiv="refresh" content="2"><title>Shadowgraph</title><p>The page is being prepared.'
 )
 TOKEN_BYTES = 24
 VISER_TITLE = b"<title>Viser</title>"
@@ -76,35 +77,28 @@ OWN_HEADERS = SAFE_HEADERS | {
 }
 
 
-class InvalidMessage(Exception):
-    """A message that our page never sends; the connection is closed."""
-
-
 class _Message(msgspec.Struct):
     type: str
     updates: Any = None
 
 
-def refuse_strange(raw: bytes | str) -> None:
-    """Return if the page sends such messages.
-
-    Raises:
-        InvalidMessage: it is malformed, large, of another kind, or changes more of a control than its value.
-    """
+def fault_of(raw: bytes | str) -> str:
+    """Return why a message is none that our page sends, "" for one that it does."""
     if isinstance(raw, str) or len(raw) > LARGEST:
-        raise InvalidMessage(f"{len(raw)} characters or bytes, where the page sends at most {LARGEST} bytes")
+        return f"{len(raw)} characters or bytes, where the page sends at most {LARGEST} bytes"
     try:
         message = msgspec.msgpack.decode(raw, type=_Message)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InvalidMessage("not a message") from error
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return "not a message"
     if message.type not in KINDS:
-        raise InvalidMessage("a kind that the page does not send")
+        return "a kind that the page does not send"
     if message.type == VALUE and not (isinstance(message.updates, dict) and set(message.updates) == {"value"}):
-        raise InvalidMessage("a control's value is all that the page changes")
+        return "a control's value is all that the page changes"
+    return ""
 
 
 class GuardedServer(viser.ViserServer):
-    """A ViserServer behind `is_own_page` and `refuse_strange`, without its banner and its public share tunnel."""
+    """A ViserServer behind `is_own_page` and `fault_of`, without its banner and its public share tunnel."""
 
     def __init__(self, host: str, port: int, stage: StageFiles | None = None, title: str = "Shadowgraph"):
         """Serve on this host and port, or on the next free port, see `get_port`.
@@ -125,10 +119,6 @@ class GuardedServer(viser.ViserServer):
         if not guards:  # another viser, which opens its socket in another way
             self.stop()
             raise RuntimeError(f"the handshake guard does not fit viser {viser.__version__}; the page was not opened")
-
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        """Return None: any client may request the tunnel, and viser answers with this method."""
-        return None
 
 
 def is_loopback(host: str) -> bool:
@@ -244,14 +234,14 @@ async def _stage_answer(connection: ServerConnection, request: Request, stage: S
             packing = asyncio.create_task(asyncio.to_thread(stage.get, name))
             found = await asyncio.wait_for(asyncio.shield(packing), PACKING_S)
     except TimeoutError:  # a handshake may not wait longer; a browser asks again by itself
-        found = StageFile(PACKING, HTML)
+        found = PACKING, HTML
     except UserError as error:
         sentence = f"{error}\n"
     answer = connection.respond(http.HTTPStatus.OK if found else http.HTTPStatus.NOT_FOUND, "" if found else sentence)
     if found is not None:
         del answer.headers["Content-Type"], answer.headers["Content-Length"]
-        answer.headers["Content-Type"], answer.headers["Content-Length"] = found.kind, str(len(found.content))
-        answer.body = found.content
+        answer.headers["Content-Type"], answer.headers["Content-Length"] = found[1], str(len(found[0]))
+        answer.body = found[0]
     answer.headers.update(HEADERS)
     return answer
 
@@ -261,7 +251,7 @@ async def _keep_document(connection: ServerConnection, stage: StageFiles) -> Non
     async for message in connection:
         content = message.encode() if isinstance(message, str) else bytes(message)
         try:
-            await asyncio.to_thread(stage.save, content)
+            await asyncio.to_thread(save_stage_document, stage.run_dir, content)
             await connection.send("")
         except UserError as error:
             await connection.send(str(error))
@@ -272,14 +262,11 @@ class _GuardedConnection(ServerConnection):
 
     async def recv(self, decode: bool | None = None) -> Any:
         message = await super().recv(decode)
-        if not _is_stage_document(self.request):
-            try:
-                refuse_strange(message)
-            except InvalidMessage as error:
-                closing = asyncio.create_task(self.close(CloseCode.POLICY_VIOLATION, str(error)))
-                while not closing.done():  # messages under way must be read, or the connection never closes
-                    await super().recv(decode)
-                await super().recv(decode)  # raises ConnectionClosed
+        if not _is_stage_document(self.request) and (fault := fault_of(message)):
+            closing = asyncio.create_task(self.close(CloseCode.POLICY_VIOLATION, fault))
+            while not closing.done():  # messages under way must be read, or the connection never closes
+                await super().recv(decode)
+            await super().recv(decode)  # raises ConnectionClosed
         return message
 
 

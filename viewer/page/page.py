@@ -2,9 +2,9 @@
 
 A run without a browser has no cost for it, a page that fails does not stop the run, and a page opened late shows the
 results so far. What is done with a finished run is the stage's (viewer/stage), to which the page leads.
-RateLimit says how often it may send what costs much, so that a run beside it keeps the processor.
 """
 
+import math
 import threading
 import time
 from pathlib import Path
@@ -39,38 +39,11 @@ from viewer.display.layers import (
     page_mesh,
     page_scale,
 )
-from viewer.display.run_follower import HULL, RunFollower, Status, loss_curves, size_text, stage_of, status
+from viewer.display.run_follower import HULL, RunFollower, loss_curves, size_text, status
 from viewer.page.controls import Controls
 
 MIN_INTERVAL_S = 2.0  # as often as a run writes its growing mesh, and as a visitor can follow
 COST_FACTOR = 25.0  # times what the last sending cost: at most a 25th of one processor, 4 % of a run that uses one
-REREAD_EVERY = 10  # polls, after which a folder without changes is read, because a killed run makes none
-
-
-class RateLimit:
-    """Says when the next sending may begin: MIN_INTERVAL_S, or COST_FACTOR times its cost, after the last one began.
-
-    The cost of a sending is the CPU time of the whole process from its beginning until `is_due` is called again: other
-    threads do the sending, once to each visitor.
-    """
-
-    def __init__(self):
-        """Allow the first sending at once."""
-        self._begun: tuple[float, float] | None = None  # clock and CPU seconds when the last sending began
-        self._cost: float | None = None  # CPU seconds of the last sending; None: not asked since
-
-    def begin(self) -> None:
-        """Note that a sending begins."""
-        self._begun, self._cost = (time.monotonic(), time.process_time()), None
-
-    def is_due(self) -> bool:
-        """Return whether another sending may begin."""
-        if self._begun is None:
-            return True
-        start, before = self._begun
-        if self._cost is None:
-            self._cost = time.process_time() - before
-        return time.monotonic() - start >= max(MIN_INTERVAL_S, COST_FACTOR * self._cost)
 
 
 class Page:
@@ -87,8 +60,8 @@ class Page:
         self.is_over = False
         self.controls = Controls(host, run_dir, self._show_layers, self.choose_photo)
         self.problem = ""  # a sentence about a damaged file of this run
-        self._polls = 0
-        self._mesh_limit, self._curve_limit = RateLimit(), RateLimit()
+        self._sent, self._cpu_s = -math.inf, 0.0  # clock and CPU seconds when surface and curves were sent last
+        self._cost_s: float | None = 0.0  # CPU seconds that it took; None: not asked since
         self._lock = threading.RLock()
         self._calibration: Calibration | None = None
         self._scale = PageScale(1.0, np.zeros(3))
@@ -99,26 +72,40 @@ class Page:
         self._hull: viser.MeshHandle | None = None
         self._lamp: LampMarker | None = None
         self._size = self._mesh_name = ""
-        self._is_framed = self._awaits_thumbnail = self._has_unsent = False
+        self._is_framed = self._awaits_thumbnail = False
         host.scene.set_up_direction("+z")
         host.scene.configure_environment_map(None)
         light_room(host, has_lamp=False)
 
     def poll(self) -> None:
-        """Look for changes in the folder, and `refresh` if there are any. It can be called at any rate."""
-        has_news = self.follower.has_news()
-        self._polls += 1
-        if has_news or self._has_unsent or self._polls % REREAD_EVERY == 1:
+        """Look for changes in the folder, and `refresh` if there are any. It can be called at any rate.
+
+        A run that is not over is looked at now and then all the same: one that is killed changes nothing.
+        """
+        if self.follower.has_news() or (self._is_due() and not self.is_over):
             self.refresh()
+
+    def _is_due(self) -> bool:
+        """Return whether surface and curves, which cost much, may be sent: a run beside this keeps the processor.
+
+        The cost of a sending is the CPU time of the whole process until this is asked: other threads do it.
+        """
+        if self._cost_s is None:
+            self._cost_s = time.process_time() - self._cpu_s
+        return time.monotonic() - self._sent >= max(MIN_INTERVAL_S, COST_FACTOR * self._cost_s)
+
+    def _begin_sending(self) -> None:
+        if self._cost_s is not None:  # else what goes with this is being sent already
+            self._sent, self._cpu_s, self._cost_s = time.monotonic(), time.process_time(), None
 
     def refresh(self) -> None:
         """Read the folder once and show what is new."""
         with self._lock:
             lines = self.follower.log()
             now = status(lines, self.follower.is_running())
-            self.is_over, self._has_unsent = now.is_over, False
+            self.is_over, is_due = now.is_over, now.is_over or self._is_due()
             try:
-                self._read_results(lines, now)
+                self._read_results(lines, is_due)
             except UserError as error:  # a damaged file: the page shows this and goes on
                 self.problem = str(error)
             if self._awaits_thumbnail:
@@ -127,31 +114,23 @@ class Page:
                 self._show_newest_photo()
             has_result = now.is_over and self._mesh_name == MESH and self.follower.has_result(lines)
             self.controls.follow(now, lines, self.problem or self._size, has_result)
-            if self._may_send(self._curve_limit, now) and self.follower.changed(LOG):
+            if is_due and self.follower.changed(LOG):
                 seconds, losses = loss_curves(lines)
                 if len(seconds) > 1:
-                    self._curve_limit.begin()
+                    self._begin_sending()
                     self.controls.show_losses(seconds, losses)
 
-    def _read_results(self, lines: list[dict[str, Any]], now: Status) -> None:
+    def _read_results(self, lines: list[dict[str, Any]], is_due: bool) -> None:
         if self.follower.changed(CALIBRATION):
             self._show_calibration()
         name = self.follower.mesh_name(lines)
-        is_ending = not now.is_over and stage_of(lines) == "report"  # the run ends within a second: no preview then
-        may_send = name and self._calibration and not is_ending and self._may_send(self._mesh_limit, now)
-        if may_send and (self.follower.changed(name) or name != self._mesh_name):
-            self._mesh_limit.begin()
+        if is_due and name and self._calibration and (self.follower.changed(name) or name != self._mesh_name):
+            self._begin_sending()
             self._show_mesh(name, self._calibration)
         if self._calibration and self.follower.changed(HULL):
             hull = read_preview(self.follower.path / HULL)
             if hull is not None:
                 self._hull = draw_hull(self.host, hull, self._scale, self.controls.shows("Shadow hull"))
-
-    def _may_send(self, limit: RateLimit, now: Status) -> bool:
-        """Return whether what costs much may be sent now; else note that the next poll must read the folder again."""
-        is_due = now.is_over or limit.is_due()
-        self._has_unsent |= not is_due
-        return is_due
 
     # --- following the folder ----------------------------------------------------------------------------------------
 

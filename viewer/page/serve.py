@@ -20,6 +20,7 @@ from reconstruct.stored_run.refusal import refuse_no_run
 from viewer.page.guard import GuardedServer, is_loopback
 from viewer.page.page import Page
 from viewer.stage.files import StageFiles
+from viewer.stage.page import is_finished
 
 POLL_S = 0.5  # between two looks at the folder: the growing mesh is written every two seconds
 GIVE_BACK_S = 60.0  # takes a twentieth of a second
@@ -72,11 +73,11 @@ def view(
     """
     refuse_no_run(Path(run_dir))
     share_memory_among_threads()
-    stage = StageFiles(Path(run_dir), "socket", home="/")
+    stage = StageFiles(Path(run_dir))
     server = GuardedServer(host, port, stage, f"{title_of(Path(run_dir))} - Shadowgraph")
     visitors = Visitors(Path(run_dir), server)
     gc.freeze()  # objects made by imports stay; without this each collection would scan them for 0.15 s
-    start = "stage/" if stage.is_ready else ""
+    start = "stage/" if is_finished(Path(run_dir)) else ""
     for line in address_lines(host, server.get_port(), server.token, start):
         say(line)
     threading.Thread(target=stage.warm, daemon=True).start()

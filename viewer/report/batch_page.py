@@ -1,26 +1,22 @@
 """index.html of a batch: one row per capture, with a picture, its state and remarks. A click on a heading sorts."""
 
+import contextlib
 import html
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
-from calibration.calibration import load_calibration
 from capture.files.atomic import atomic_file
 from capture.files.regular import is_regular
 from reconstruct.run.batch import LOGS, Outcome, Task
 from reconstruct.run_folder.forecast import duration_text
-from reconstruct.stored_run.ply import read_mesh
-from reconstruct.stored_run.stored_run import CALIBRATION, MESH
+from reconstruct.stored_run.stage_pack import read_stage_pack
 from viewer.display.run_follower import size_text
 from viewer.report import document as doc
-from viewer.report.drawing import mesh_picture
-from viewer.report.pictures import guessed_share, view_from_camera
+from viewer.report.pictures import guessed_share
 
-INDEX, THUMBNAIL = "index.html", "thumbnail.png"
-THUMBNAIL_PX = (160, 120)
+INDEX, THUMBNAIL = "index.html", "thumbnail.jpg"
 SORT = """
 document.querySelectorAll('th').forEach((head,column)=>{head.tabIndex=0;head.onclick=head.onkeydown=event=>{
 if(event.type==='keydown'&&event.key!=='Enter')return;
@@ -61,12 +57,12 @@ def write_batch_page(folder: Path, tasks: Sequence[Task], outcomes: Mapping[str,
 
 
 def write_thumbnail(run_dir: Path) -> None:
-    """Write thumbnail.png of a finished run: its mesh from the camera's side. A run without a mesh gets none."""
-    if (run_dir / MESH).is_file():
-        mesh = read_mesh(run_dir / MESH)
-        back = view_from_camera(mesh, load_calibration(run_dir / CALIBRATION))
-        with atomic_file(run_dir / THUMBNAIL) as temporary:
-            Image.fromarray(mesh_picture(mesh, back, THUMBNAIL_PX)).save(temporary, "PNG")
+    """Write thumbnail.jpg of a finished run: the picture that its stage begins with; none where it has no stage."""
+    with contextlib.suppress(OSError):
+        pack = read_stage_pack(run_dir)
+        if pack is not None:
+            with atomic_file(run_dir / THUMBNAIL) as temporary:
+                temporary.write_bytes(pack.read(pack.facts["addresses"]["first"]))
 
 
 def _row(folder: Path, task: Task, outcome: Outcome | None) -> str:

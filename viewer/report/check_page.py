@@ -1,6 +1,5 @@
 """The result of `shadowgraph check` as a page (check.html) and as lines of text for the terminal."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +8,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from calibration.board.board_scale import scale_sentence
-from calibration.calibration import Calibration
 from calibration.light import Light
 from capture.files.atomic import atomic_file
 from capture.photos.photo import encode_srgb, read_photo
-from reconstruct.check.light_coverage import ShadowCover, directions, from_the_camera, side_in_words
+from reconstruct.check.light_coverage import ShadowCover, side_in_words
 from reconstruct.check.verdict import CaptureCheck
 from viewer.report import document as doc
 from viewer.report.drawing import enlarged
@@ -23,7 +21,6 @@ PAGE = "check.html"
 PICTURE_WIDTH = 520  # px
 SHADOW_COLOURS = np.array([[255, 214, 102], [240, 120, 60], [150, 40, 120]], float)  # few, some, many photos
 MANY_TIMES = 0.5  # of the photos: as often in shadow as ground beside an object is
-PLOT_ROWS = 11  # of the polar plot in the terminal; a character is about twice as high as wide
 MARGIN_SHARE = 0.04  # of a photo's longer side: least half width of the part with LED and lenses
 LED, CHOSEN, CANDIDATE = (255, 205, 40), (70, 210, 90), (240, 110, 90)
 FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -55,7 +52,7 @@ def check_page(checked: CaptureCheck) -> str:
             "Light",
             "Each dot is the flashlight in one photo. Light from all sides, low and high, shows the whole shape.",
             doc.row(
-                doc.figure(coverage(calibration, cover.centre), "Seen from the object: above in the middle"),
+                doc.figure(coverage(calibration, cover.centre), "From the object: overhead is in the middle"),
                 doc.figure(lights_from_above(calibration, None), "Seen from above, with two-sigma ellipses"),
             ),
         ),
@@ -169,7 +166,10 @@ def back_picture(photo: UInt8[np.ndarray, "height width 3"], read: dict[str, Any
 def _further(checked: CaptureCheck) -> str:
     """Return lights, shadows and photos of a further view."""
     pictures = doc.row(
-        doc.figure(coverage(checked.calibration, checked.cover.centre), "Seen from the object: above in the middle"),
+        doc.figure(
+            coverage(checked.calibration, checked.cover.centre),
+            "From the object: overhead is in the middle",
+        ),
         doc.figure(enlarged(shadow_picture(checked.cover), PICTURE_WIDTH), _shadow_caption(checked.cover)),
     )
     return doc.section(checked.name, "Another place of the tripod.", pictures + _photo_table(checked))
@@ -203,28 +203,11 @@ def _place(light: Light, checked: CaptureCheck) -> list[str]:
 
 
 def check_lines(checked: CaptureCheck) -> list[str]:
-    """Return the verdict as lines for the terminal: reasons, lights as a polar plot, what to shoot next."""
+    """Return the verdict as lines for the terminal: reasons, remarks on photos, what to shoot next."""
     readiness = checked.readiness
     lines = [readiness.sentence(), *(f"  - {reason}" for reason in readiness.reasons[1:])]
     lines += filter(None, [scale_sentence(checked.calibration.residuals)])
-    lines += ["", "Lights seen from above, camera at the bottom, o = used, x = not used:"]
-    lines += polar_plot(checked.calibration, checked.cover)
     lines += [f"{f.called}: {f.kind}, {f.text}" for f in checked.findings]
     lines += [f"{one.name}, {f.photo.name}: {f.kind}, {f.text}" for one in checked.further for f in one.findings]
     lines += [f"Shoot next: {advice}" for advice in readiness.advice]
     return lines
-
-
-def polar_plot(calibration: Calibration, cover: ShadowCover) -> Sequence[str]:
-    """Plot the directions of the lights in characters: zenith in the middle, horizon at the rim, camera below."""
-    half = PLOT_ROWS // 2
-    cells = [[" "] * (4 * half + 3) for _ in range(2 * half + 1)]
-    for angle in np.linspace(0, 2 * np.pi, 72, endpoint=False):
-        cells[half + round(half * np.sin(angle))][2 * half + 1 + round(2 * half * np.cos(angle))] = "."
-    cells[half][2 * half + 1] = "+"
-    for light, way in zip(calibration.lights, directions(calibration, cover.centre), strict=True):
-        reach = half * np.arccos(np.clip(way[2], 0, 1)) / (np.pi / 2)
-        turn = from_the_camera(float(np.arctan2(way[1], way[0])), calibration.posed_camera, cover.centre)
-        row, column = half + round(reach * np.cos(turn)), 2 * half + 1 + round(2 * reach * np.sin(turn))
-        cells[row][column] = "o" if light.used else "x"
-    return ["".join(row).rstrip() for row in cells]

@@ -1,9 +1,10 @@
 """The HTML elements of the report. They escape all text that is given to them."""
 
+import base64
+import hashlib
 import html
 from collections.abc import Sequence
 
-from viewer.display.embedded import hash_of
 from viewer.report.drawing import Picture, data_uri
 
 STYLE = """
@@ -65,6 +66,12 @@ def page(title: str, body: str, style: str = "", script: str = "") -> str:
         f"<title>{html.escape(title)}</title><style>{STYLE}{style}</style></head><body><main>{body}</main>{code}</body>"
         "</html>\n"
     )
+
+
+def hash_of(text: str) -> str:
+    """Return the source of a script or style by its hash, for a content security policy."""
+    digest = hashlib.sha256(text.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode()}'"
 
 
 def section(title: str, explanation: str, body: str) -> str:

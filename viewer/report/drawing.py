@@ -1,5 +1,6 @@
 """Small 8-bit sRGB pictures: of photos, of depth and normals, and of a mesh, drawn without a graphics card."""
 
+import base64
 import io
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -10,7 +11,6 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
 from capture.photos.photo import decode_srgb, encode_srgb
-from viewer.display.embedded import as_address, jpeg
 
 if TYPE_CHECKING:  # beside a run a page shows photos only, and opens sooner without it
     import trimesh
@@ -31,6 +31,18 @@ DARKER, SAME, BRIGHTER = (52, 119, 219), (236, 236, 236), (226, 74, 51)  # of a 
 STRONG_DIFFERENCE = 0.2  # of full sRGB scale: shown as full colour
 
 
+def jpeg(picture: UInt8[np.ndarray, "height width 3"], quality: int, is_exact: bool = False) -> bytes:
+    """Return a picture as JPEG; with `is_exact` its colours are kept at full resolution, as those of normals."""
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, format="JPEG", quality=quality, subsampling=0 if is_exact else 2)
+    return file.getvalue()
+
+
+def as_address(content: bytes, kind: str) -> str:
+    """Return a file as a data address."""
+    return f"data:{kind};base64," + base64.b64encode(content).decode()
+
+
 def data_uri(picture: Picture) -> str:
     """Return the picture as a data: address for an <img>: JPEG, or PNG if it has no background."""
     if picture.shape[-1] == 3:
@@ -42,18 +54,17 @@ def data_uri(picture: Picture) -> str:
 
 def reduced(picture: Picture, width: int) -> Picture:
     """Return the picture at most `width` px wide."""
-    if picture.shape[1] <= width:
-        return picture
-    height = max(1, round(picture.shape[0] * width / picture.shape[1]))
-    return np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.BOX))
+    return picture if picture.shape[1] <= width else _resized(picture, width, Image.Resampling.BOX)
 
 
 def enlarged(picture: Picture, width: int) -> Picture:
     """Return the picture at least `width` px wide."""
-    if picture.shape[1] >= width:
-        return picture
+    return picture if picture.shape[1] >= width else _resized(picture, width, Image.Resampling.BICUBIC)
+
+
+def _resized(picture: Picture, width: int, how: Image.Resampling) -> Picture:
     height = max(1, round(picture.shape[0] * width / picture.shape[1]))
-    return np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.BICUBIC))
+    return np.asarray(Image.fromarray(picture).resize((width, height), how))
 
 
 def depth_picture(depth: Float[np.ndarray, "height width"], mask: Bool[np.ndarray, "height width"]) -> Picture:

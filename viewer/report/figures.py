@@ -1,7 +1,7 @@
 """Drawings for the report as SVG text, coloured by the page's CSS variables: lights from above, coverage, curves."""
 
 import html
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -15,9 +15,7 @@ from viewer.report import document as doc
 CURVE_COLOURS = ("#d9820f", "#2f7be0", "#2e9d69", "#c8427b", "#7d5fd3", "#6b7483", "#119aa8", "#cf4f22")
 SIGMAS_SHOWN = 2.0
 DOT = 5.0  # px
-WAY = 60.0  # px: the longest line of a light that moved, at most
 CIRCLES = (0, 30, 60)  # degrees above the horizon, drawn where light came from
-PAUSE = 10.0  # median steps: after a longer one a curve starts anew
 
 
 def svg(width: float, height: float, parts: Sequence[str], label: str) -> str:
@@ -39,16 +37,11 @@ def _dot(x: float, y: float, light: Light) -> str:
     return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{DOT}" {style}><title>{title}</title></circle>'
 
 
-def lights_from_above(
-    calibration: Calibration,
-    footprint: Float[np.ndarray, "2 3"] | None,
-    refined: Mapping[str, Float[np.ndarray, "3"]] | None = None,
-) -> str:
+def lights_from_above(calibration: Calibration, footprint: Float[np.ndarray, "2 3"] | None) -> str:
     """Draw point lights, camera and object from above, x to the right and y up, with two-sigma ellipses.
 
     Args:
         footprint: the mesh's lower and upper corner, world; None = no mesh.
-        refined: where a solve left the lights of some photos, world; drawn as lines, longer than the way.
     """
     lights = [light for light in calibration.lights if light.position is not None]
     eye = calibration.world_from_camera.translation
@@ -78,7 +71,6 @@ def lights_from_above(
                 'opacity=".22"/>'
             )
         parts.append(_dot(x, y, light))
-    parts += _ways(lights, refined or {}, scale, at)
     x, y = at(eye)
     parts.append(f'<path d="M{x - 7:.1f} {y + 6:.1f}h14l-7 -13z" fill="var(--text)"/>')
     parts.append(text(x, y + 20, "camera"))
@@ -86,30 +78,6 @@ def lights_from_above(
     parts.append(f'<path d="M14 {size - 14}h{length * scale:.1f}" stroke="var(--text)" stroke-width="2"/>')
     parts.append(text(14, size - 20, f"{length:g} {doc.length_unit(calibration.unit)}", "start"))
     return svg(size, size, parts, "Lights, camera and object from above")
-
-
-def _ways(
-    lights: Sequence[Light],
-    refined: Mapping[str, Float[np.ndarray, "3"]],
-    scale: float,
-    at: Callable[[np.ndarray], tuple[float, float]],
-) -> list[str]:
-    """Draw a line from each light towards its refined place, all enlarged by one factor, and text that states it.
-
-    Args:
-        scale: px per world length; at: the pixel of a world point.
-    """
-    ends = [(x.position, refined[x.photo]) for x in lights if x.position is not None and x.photo in refined]
-    longest = max((float(np.linalg.norm((b - a)[:2])) for a, b in ends), default=0.0)
-    if longest == 0:
-        return []
-    times = max(1.0, _round_length(WAY / (scale * longest)))
-    parts = []
-    for start, end in ends:
-        (x, y), (u, v) = at(start), at(start + times * (end - start))
-        parts.append(f'<path d="M{x:.1f} {y:.1f}L{u:.1f} {v:.1f}" stroke="var(--text)" stroke-width="1.5"/>')
-        parts.append(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="2" fill="var(--text)"/>')
-    return [*parts, text(14, 18, f"lines: {times:g} times as long as the way", "start")]
 
 
 def _round_length(about: float) -> float:
@@ -172,23 +140,12 @@ def curves(x: Float[np.ndarray, " n"], series: Mapping[str, Float[np.ndarray, " 
     parts.append(text((left + width) / 2, height - 8, x_label))
     for (name, y_values), colour in zip(series.items(), CURVE_COLOURS * len(series), strict=False):
         title = f"<title>{html.escape(name)}</title>"
-        for part in _unbroken(x, y_values):
-            u = left + (width - left) * (x[part] - x.min()) / span
-            points = " ".join(f"{a:.1f},{at_y(b):.1f}" for a, b in zip(u, y_values[part], strict=True))
-            parts.append(
-                f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="2">{title}</polyline>'
-            )
+        good = np.isfinite(y_values) & (y_values > 0)
+        u = left + (width - left) * (x[good] - x.min()) / span
+        points = " ".join(f"{a:.1f},{at_y(b):.1f}" for a, b in zip(u, y_values[good], strict=True))
+        parts.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="2">{title}</polyline>')
     legend = "".join(
         f'<span class="key"><i style="background:{colour}"></i>{html.escape(name)}</span>'
         for name, colour in zip(series, CURVE_COLOURS * len(series), strict=False)
     )
     return f'{svg(width, height, parts, "Curves")}<div class="legend">{legend}</div>'
-
-
-def _unbroken(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> list[np.ndarray]:
-    """Indices of the positive values, cut where the run did something else for a while."""
-    good = np.flatnonzero(np.isfinite(y) & (y > 0))
-    if len(good) < 2:
-        return [good]
-    gaps = np.diff(x[good])
-    return np.split(good, np.flatnonzero(gaps > PAUSE * max(float(np.median(gaps)), 1e-9)) + 1)

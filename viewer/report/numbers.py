@@ -177,42 +177,18 @@ def cost_part(stages: Mapping[str, Mapping[str, Any]]) -> str:
         rows.append(("Together", duration_text(total[0]), f"{total[1]:.1f}", f"{peak / MEGABYTE:,.0f}"))
     return doc.section(
         "Time and memory",
-        "Time on the clock, time that processors were busy (more than the clock if several were), most memory held.",
+        "Time on the clock, time of all processors together, and the most memory held at once.",
         doc.table(("step", "time", "CPU seconds", "memory, MB"), rows, numbers=(1, 2, 3)),
     )
 
 
-def refinement_part(report: Mapping[str, Any], calibration: Calibration | None, mesh: trimesh.Trimesh | None) -> str:
-    """Return the part about refined lights: how far each moved, and whether the moves were kept."""
+def refinement_part(report: Mapping[str, Any]) -> str:
+    """Return the part about refined lights: whether their moves were kept, and how far they went."""
     trial, rows = report.get("light_trial"), report.get("refined_lights", [])
     if not trial:
         return ""
-    decided = doc.bullets([str(trial["sentence"]).capitalize() + "."])
-    if not trial["accepted"] or calibration is None:
-        return doc.section("Refined lights", EXPLANATION, decided)
-    places = {row["photo"]: np.array(row["position"]) for row in rows if "position" in row}
-    drawing = ""
-    if places:
-        above = lights_from_above(calibration, None if mesh is None else mesh.bounds, places)
-        drawing = doc.figure(above, "From above: from where the calibration put each light to where the shadows do")
-    return doc.section("Refined lights", EXPLANATION, decided + drawing + _table(rows, calibration.unit))
-
-
-def _table(rows: Sequence[Mapping[str, Any]], unit: str) -> str:
-    """One line per light; directions in degrees."""
-    is_point = any("position" in row for row in rows)
-    name = doc.length_unit(unit) if is_point else "degrees"
-    scale = 1.0 if is_point else float(np.degrees(1))
-    cells = [
-        (
-            row["photo"],
-            f"{scale * row['moved']:.3g}",
-            f"{scale * np.linalg.norm(row['sigma']):.2g}",
-            f"{row['sigmas']:.2f}",
-        )
-        for row in rows
-    ]
-    moved, sigmas = (np.median([row[key] for row in rows]) for key in ("moved", "sigmas"))
-    cells.append(("Half of them less than", f"{scale * moved:.3g}", "", f"{sigmas:.2f}"))
-    head = ("photo", f"moved by ({name})", f"calibrated to ± ({name})", "moved by (times ±)")
-    return doc.folded("How far each light moved", doc.table(head, cells, numbers=(1, 2, 3)))
+    told = [str(trial["sentence"]).capitalize() + "."]
+    if trial["accepted"] and rows:
+        middle = np.median([row["sigmas"] for row in rows])
+        told.append(f"Half of the lights moved by less than {middle:.2f} times their ±.")
+    return doc.section("Refined lights", EXPLANATION, doc.bullets(told))

@@ -115,7 +115,7 @@ def report_page(results: Results) -> str:
         photos_part(results.report.get("photos", []), results.calibration, results.thumbs),
         calibration_part(results.calibration),
         lights_part(results.calibration, results.mesh),
-        refinement_part(results.report, results.calibration, results.mesh),
+        refinement_part(results.report),
         curves_part(results.log, results.report.get("fit", {})),
         cost_part(results.report.get("stages", {})),
         _origin(results.report),

@@ -18,15 +18,14 @@ from calibration.pose import Pose
 from capture.errors import UserError
 from capture.photos.photo import decode_srgb
 from reconstruct.appearance.brdf import MATERIALS, SHARPNESS, facing_reflectances
-from reconstruct.export.export import UNIT_WORDS, Contents
+from reconstruct.export.export import UNIT_WORDS
 from reconstruct.export.first_view import LAMP, SKY
 from reconstruct.export.stage_scene import FULL_WEIGHT, GROUND_HALF, StageScene
 from reconstruct.fields import SolvedScene
-from reconstruct.mesh.evidence import KINDS
 from reconstruct.render.studio import KEY_DISTANCE, LAMP_RADII, Studio, direction_of, looking_at, towards
 from reconstruct.stored_run.stage_pack import FORMAT
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.stage.pack import Block
+from viewer.display.run_follower import size_text
 
 MOST_LIGHTS = 200  # markers that are drawn
 STRAIGHT_DOWN = 1.5  # rad: above this elevation a camera's azimuth is told by its picture's lower edge
@@ -35,8 +34,11 @@ FADE = (2.5, 7.0)  # radii of the object from its middle, over which ground outs
 LARGEST_LAMP = 3.0  # radii of the object
 OUTLINE_WAYS = 200  # 8 degrees apart: an outline is short by less than a hundredth
 FIRST_MARGIN = 1.6  # side of the first picture over the object's larger one
-SIGNS = {"seen": "seen", "shadow": "shadow", "guess": "unconstrained"}  # of the legend, in the page's style
-WORDS = {"seen": "seen in the photos", "shadow": "held by shadows", "unconstrained": "a guess"}
+LEGEND = {  # by the evidence of a run
+    "seen": ("seen", "seen in the photos"),
+    "shadow": ("shadow", "held by shadows"),
+    "unconstrained": ("guess", "a guess"),
+}
 
 
 def camera_facts(seen: SolvedScene, studio: Studio) -> dict[str, Any]:
@@ -69,24 +71,22 @@ def camera_facts(seen: SolvedScene, studio: Studio) -> dict[str, Any]:
 def lit_photos(run: StoredRun) -> list[tuple[str, int, Light, SolvedScene]]:
     """Return each photo's name, the number of its camera, its light, and what that camera saw.
 
-    A photo of a further view is called VIEW/NAME, as its small copy is.
-
-    Raises:
-        UserError: the run's calibration cannot be read.
+    A photo of a further view is called VIEW/NAME, as its small copy is. Without a calibration that can be read there
+    are none.
     """
+    try:
+        views = run.views
+    except UserError:
+        return []
     return [
         (f"{name}/{light.photo}" if number else light.photo, number, light, seen)
-        for number, (name, calibration, seen) in enumerate(run.views)
+        for number, (name, calibration, seen) in enumerate(views)
         for light in calibration.lights
     ][:MOST_LIGHTS]
 
 
 def light_facts(run: StoredRun, studio: Studio) -> list[dict[str, Any]]:
     """Return the calibrated lights as places; a direction is a place far away."""
-    try:
-        photos = lit_photos(run)
-    except UserError:
-        return []
     return [
         {
             "photo": name,
@@ -95,7 +95,7 @@ def light_facts(run: StoredRun, studio: Studio) -> list[dict[str, Any]]:
             "used": light.used,
             "far": light.position is None,
         }
-        for name, number, light, seen in photos
+        for name, number, light, seen in lit_photos(run)
     ]
 
 
@@ -112,25 +112,25 @@ def stage_facts(
     run: StoredRun,
     studio: Studio,
     scene: StageScene,
-    block: Block,
+    parts: Mapping[str, Any],
     lamp: tuple[float, float],
     addresses: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Return what the page's scripts read. World lengths, radians, linear colours.
 
     Args:
+        parts: of the packed mesh, what `packed` says of them.
         lamp: azimuth and elevation of the first one, rad.
-        addresses: of the parts: "block", "object", "ground", "first", "normals" (or None), "photos" by name, "tiles"
-            (or None).
+        addresses: of the parts: "block", "object", "ground", "first", "photos" by name; "normals", and "fine" with
+            "fineNormals", or None.
     """
     fields = run.fields
     return {
         "format": FORMAT,
         "name": run.name,
         "unit": UNIT_WORDS[run.unit],
-        "size": size_sentence(run),
-        "known": known_shares(run),
-        "kinds": {sign: WORDS[kind] for sign, kind in SIGNS.items()},
+        "size": size_text(run.mesh.extents, run.unit),
+        "legend": legend(run),
         "centre": studio.centre.tolist(),
         "radius": studio.radius,
         "bounds": np.asarray(run.mesh.bounds).tolist(),
@@ -148,7 +148,7 @@ def stage_facts(
         "largestLamp": LARGEST_LAMP * studio.radius,
         "ambient": SKY,
         "lights": light_facts(run, studio),
-        "parts": block.parts,
+        "parts": parts,
         "objectWindow": list(scene.object_window),
         "gloss": _gloss(fields, scene),
         "materials": _materials(),
@@ -156,39 +156,23 @@ def stage_facts(
     }
 
 
-def known_shares(run: StoredRun) -> dict[str, float]:
-    """Return the share of the surface that is seen, held by shadows, and a guess; empty where the run does not say."""
+def legend(run: StoredRun) -> list[dict[str, Any]]:
+    """Return what is known of the surface: signs of the page's style, words, and shares where the run states them."""
     try:
         evidence = run.report.get("mesh", {}).get("evidence") or {}
     except UserError:  # a run without a report can be looked at, too
-        return {}
-    return {WORDS[kind]: float(evidence[kind]["share"]) for kind in reversed(KINDS) if kind in evidence}
-
-
-def size_sentence(run: StoredRun) -> str:
-    """Return the object's size in words."""
-    x, y, z = (float(e) for e in run.mesh.extents)
-    return Contents(extents=(x, y, z)).sentence(run.unit)
-
-
-def home_view(fields: SolvedScene, studio: Studio) -> dict[str, float]:
-    """Return the first view: from where the photos were taken, towards the object."""
-    return camera_facts(fields.views()[0], studio)["home"]
+        evidence = {}
+    return [
+        {"sign": sign, "words": words, "share": float(evidence[kind]["share"]) if kind in evidence else None}
+        for kind, (sign, words) in LEGEND.items()
+    ]
 
 
 def home_pose(fields: SolvedScene, studio: Studio) -> Pose:
-    """Return world_from_camera of the first view."""
-    home = home_view(fields, studio)
+    """Return world_from_camera of the first view: from where the photos were taken, towards the object."""
+    home = camera_facts(fields.views()[0], studio)["home"]
     eye = studio.centre + home["distance"] * towards(home["azimuth"], home["elevation"])
     return looking_at(eye, studio.centre)
-
-
-def box_at_home(vertices: Float[np.ndarray, "n 3"], fields: SolvedScene, studio: Studio) -> list[float]:
-    """Return the object's box in the first view: left, top, right and bottom as tangents from its axis."""
-    pose = home_pose(fields, studio)
-    seen = (vertices - pose.translation) @ pose.rotation
-    slopes = seen[:, :2] / seen[:, 2:]
-    return [*slopes.min(0).tolist(), *slopes.max(0).tolist()]
 
 
 def outline_points(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
@@ -200,11 +184,16 @@ def outline_points(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]
 
 
 def first_window(vertices: Float[np.ndarray, "n 3"], fields: SolvedScene, studio: Studio) -> list[float]:
-    """Return what the first picture shows, as `box_at_home`: a square around the object with some of its ground."""
-    left, top, right, bottom = box_at_home(vertices, fields, studio)
-    half = FIRST_MARGIN * max(right - left, bottom - top) / 2
-    across, down = (left + right) / 2, (top + bottom) / 2
-    return [across - half, down - half, across + half, down + half]
+    """Return what the first picture shows: a square around the object with some of its ground, in the first view.
+
+    Left, top, right and bottom are tangents from its axis.
+    """
+    pose = home_pose(fields, studio)
+    seen = (vertices - pose.translation) @ pose.rotation
+    slopes = seen[:, :2] / seen[:, 2:]
+    low, high = slopes.min(0), slopes.max(0)
+    middle, half = (low + high) / 2, FIRST_MARGIN * (high - low).max() / 2
+    return [*(middle - half).tolist(), *(middle + half).tolist()]
 
 
 def _lamp(lamp: tuple[float, float], studio: Studio) -> dict[str, float]:

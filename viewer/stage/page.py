@@ -1,6 +1,10 @@
-"""The stage as a page: in one file with all its parts, or as a page that asks for its parts beside it."""
+"""The stage of a finished run as a page: one file with all its parts, which works without a server or a network.
+
+Its parts are packed in stage.zip, which `shadowgraph run` leaves; a run without one is packed when its page is made.
+"""
 
 import base64
+import gzip
 import html
 import json
 import re
@@ -11,23 +15,21 @@ from typing import Any
 import numpy as np
 
 from capture.errors import ReconstructionError
+from capture.files.atomic import atomic_file
 from capture.files.title import title_of
 from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, OnProgress
-from reconstruct.export.formats import FORMATS
+from reconstruct.export.formats import FORMATS, Format
 from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
-from reconstruct.stored_run.stage_pack import StagePack, addressed
-from reconstruct.stored_run.stored_run import StoredRun
-from viewer.display.embedded import as_address, hash_of
-from viewer.stage.pack import unpacked_corners
-from viewer.stage.pack_file import kind_of, stage_pack
+from reconstruct.stored_run.stage_pack import STAGE_PACK, StagePack, addressed, marks_of, read_stage_pack
+from reconstruct.stored_run.stored_run import FIELDS, MESH, StoredRun
+from viewer.report.document import hash_of
+from viewer.report.drawing import as_address
 
 SCRIPTS = (
     "vectors",
     "scene",
     "state",
     "gpu",
-    "coarse",
-    "tiles",
     "passes",
     "renderer",
     "pick",
@@ -42,10 +44,72 @@ SHADERS += ("lines.vert", "lines.frag")
 READ_ERRORS = (OSError, ValueError, LookupError, TypeError, EOFError)
 IMPORTED, EXPORTED = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL), re.compile(r"^export ", re.MULTILINE)
 SCENE = re.compile(r'<script type="application/json" id="scene">(.*?)</script>', re.DOTALL)
+PAGE = Format(
+    ".html",
+    "A page to send to somebody",
+    "One file: the light follows the pointer, no server is needed.",
+    "viewer.stage.page:write_page",
+)
+_rows = list(FORMATS.items())
+_rows.insert(list(FORMATS).index("3mf") + 1, ("html", PAGE))  # behind which a person looks for it
+FORMATS.clear()
+FORMATS.update(_rows)
+
+
+def is_finished(run_dir: Path) -> bool:
+    """Return whether the run has left what the stage shows."""
+    return all((run_dir / name).is_file() for name in (MESH, FIELDS))
+
+
+def kept_pack(run_dir: Path) -> StagePack | None:
+    """Return the packed stage that is kept with the run; None where there is none of its results.
+
+    Raises:
+        ReconstructionError: the run is not finished, or cannot be read.
+    """
+    if not is_finished(run_dir):
+        raise ReconstructionError(f"{run_dir} holds no finished run yet: its picture comes with the mesh.")
+    try:
+        return read_stage_pack(run_dir)
+    except OSError as error:
+        raise ReconstructionError(f"{run_dir} cannot be read ({error.strerror or error}).") from error
+
+
+def stage_pack(run_dir: Path, made: StagePack | None = None) -> StagePack:
+    """Return the packed stage of a run, made in memory where the run keeps none.
+
+    Args:
+        made: one that was made before, which is returned if it is of the run's results as they are now.
+
+    Raises:
+        UserError: the run is not finished, or a file of it cannot be used.
+    """
+    pack = kept_pack(run_dir)
+    if pack is None and made is not None and made.facts["madeOf"] == marks_of(run_dir):
+        return made
+    if pack is None:
+        from viewer.stage.parts import packed_stage  # torch takes seconds to import; a packed stage needs none of it
+
+        pack = StagePack(packed_stage(StoredRun(run_dir)))
+    return pack
+
+
+def write_stage(run_dir: Path) -> None:
+    """Write the packed stage of a run into its folder, whole or not at all.
+
+    Raises:
+        UserError: a file of the run cannot be used.
+        OSError: it cannot be written.
+    """
+    from viewer.stage.parts import packed_stage
+
+    content = packed_stage(StoredRun(run_dir))
+    with atomic_file(run_dir / STAGE_PACK) as temporary:
+        temporary.write_bytes(content)
 
 
 def stage_page(run_dir: Path, on_progress: OnProgress = lambda done, total, message: None) -> str:
-    """Return the page of a finished run with everything in it; it works from a file, without a server or a network.
+    """Return the page of a finished run with everything in it.
 
     Raises:
         UserError: the run is not finished, or a file of it cannot be used.
@@ -53,7 +117,16 @@ def stage_page(run_dir: Path, on_progress: OnProgress = lambda done, total, mess
     on_progress(0, 2, "packing the scene")
     pack = stage_pack(run_dir)
     on_progress(1, 2, "writing the page")
-    return page_html(title_of(run_dir), pack, read_stage_document(run_dir))
+    return page_of(run_dir, pack)
+
+
+def page_of(run_dir: Path, pack: StagePack, saves: str = "", home: str = "") -> str:
+    """Return the page of a run, whose packed stage this is, with its title and document; see `page_html`.
+
+    Raises:
+        UserError: the document cannot be used.
+    """
+    return page_html(title_of(run_dir), pack, read_stage_document(run_dir), saves, home)
 
 
 def page_html(
@@ -67,17 +140,16 @@ def page_html(
 
     Args:
         document: notes and views, None: none yet.
-        saves: how its document can be kept with the run: "socket", its parts are then beside it, or "frame", the page
-            around it keeps it; "": it cannot.
-        home: address of the page that led here; "": none.
+        saves: how its document can be kept with the run: "socket" (WebSocket stage.json of its server, which also makes
+            other kinds of files), "frame" (a message to the page around it, as this one has no origin); "": it cannot.
+        home: address of the page that led here, for a link back; "": none.
     """
     is_served = saves == "socket"
-    addresses = {part: part if is_served else as_address(pack.read(part), kind_of(part)) for part in pack.names}
-    facts = addressed(pack.facts, addresses)
+    facts = addressed(pack.facts, {part: as_address(pack.read(part), kind_of(part)) for part in pack.names})
     values = {
         "title": html.escape(name),
         "size": html.escape(str(facts["size"])),
-        "policy": page_policy(is_served),
+        "policy": page_policy("'self'" if is_served else "'none'"),
         "style": _asset("stage.css"),
         "first": html.escape(facts["addresses"]["first"]),
         "scene": _json({**facts, "name": name}),
@@ -97,12 +169,15 @@ def _file_kinds() -> dict[str, tuple[str, str]]:
     return {name: (row.title, row.suffix) for name, row in rows if "frames" not in row.takes and name != "html"}
 
 
-def page_policy(is_served: bool) -> str:
-    """Return the page's content security policy: its own script and style, and nothing from elsewhere."""
-    own, connects = ("'self' ", "'self'") if is_served else ("", "'none'")
+def page_policy(connects: str = "'none'") -> str:
+    """Return the page's content security policy: its own script and style, and nothing from elsewhere.
+
+    Args:
+        connects: whom the script may ask.
+    """
     return (
         f"default-src 'none'; script-src {hash_of(script_text())}; style-src {hash_of(_asset('stage.css'))}; "
-        f"img-src {own}data: blob:; connect-src {connects}; base-uri 'none'; form-action 'none'"
+        f"img-src data: blob:; connect-src {connects}; base-uri 'none'; form-action 'none'"
     )
 
 
@@ -113,6 +188,11 @@ def script_text() -> str:
     """
     parts = [EXPORTED.sub("", IMPORTED.sub("", _asset(f"{name}.js"))) for name in SCRIPTS]
     return "\n" + "\n".join(parts)
+
+
+def kind_of(part: str) -> str:
+    """Return the media type of a part."""
+    return "image/jpeg" if part.endswith(".jpg") else "application/octet-stream"
 
 
 def write_page(run: StoredRun, path: Path, options: ExportOptions, progress: OnProgress) -> None:
@@ -131,15 +211,12 @@ def read(run: StoredRun, path: Path) -> Contents:
         if found is None:
             raise ValueError("it holds no scene")
         facts = json.loads(found.group(1))
-        block = base64.b64decode(facts["addresses"]["block"].partition(",")[2])
-        corners, vertices = unpacked_corners(block, facts["parts"]), facts["parts"]["places"]["count"]
-        if not len(corners) or corners.min() < 0 or corners.max() >= vertices:
-            raise ValueError("its triangles name places that are not there")
+        gzip.decompress(base64.b64decode(facts["addresses"]["block"].partition(",")[2]))  # which checks its sum
     except READ_ERRORS as error:
         raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
     x, y, z = (float(e) for e in np.ptp(np.asarray(facts["bounds"]), axis=0))
     note = f"{len(facts['lights'])} lights, {UNIT_WORDS[run.unit]}; open it in any browser"
-    return Contents(len(corners) // 3, (x, y, z), note=note)
+    return Contents(facts["parts"]["corners"]["count"] // 3, (x, y, z), note=note)
 
 
 def _json(value: Any) -> str:

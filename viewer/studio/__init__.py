@@ -1,4 +1,4 @@
-"""The studio: captures and runs of a folder in the browser, from a phone in the hand to a thing on the screen.
+"""The studio: captures and runs of a folder in the browser, from photos to a model on the screen.
 
 One idea: the folder is the truth. Captures, runs and what the studio keeps (`.studio/`: queue, files under way,
 trash) are files that are written whole; the server holds nothing else, so it can be killed and started again, and

@@ -8,8 +8,7 @@ import hashlib
 import subprocess
 import time
 from collections.abc import Sequence
-from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,8 @@ from capture.session.session import FEWEST_LIT
 from capture.session.skipped import clips_of, photos_of
 from reconstruct.run.batch import start_command, why_it_failed
 from reconstruct.stored_run.documents import CHECK, read_check
-from viewer.studio.helper import Helper
-from viewer.studio.words import without_folder
+from viewer.studio.folder import mark_of, without_folder
+from viewer.studio.helper import Helper, Newest
 
 PAUSE_S = 3.0  # without a new photo, after which a verdict is made
 LOG = "said.txt"
@@ -33,10 +32,6 @@ class _Watched:
 
     mark: str = ""  # of its files
     changed: float = 0.0  # when, by our clock
-    looked: str = ""  # the mark that the looks belong to
-    looks: dict[str, Any] = field(default_factory=lambda: {"photos": [], "lights": [], "advice": ""})
-    pending: "Future[Any] | None" = None
-    pending_mark: str = ""
     asked: float = 0.0  # when somebody last looked
     wants: bool = False  # a verdict as soon as possible
 
@@ -46,21 +41,15 @@ class Checks:
 
     def __init__(self, folder: Path, helper: Helper, program: Sequence[str]):
         """Keep verdicts in `folder`; `program` is the command `shadowgraph`."""
-        self._folder, self._helper, self._program = folder, helper, program
+        self._folder, self._program = folder, program
+        self._looks = Newest(helper, "look")
         self._watched: dict[Path, _Watched] = {}
         self._process: tuple[Path, str, subprocess.Popen[bytes]] | None = None
 
     def looks(self, capture: Path) -> dict[str, Any]:
         """Return the newest first look, and ask for another where photos have changed. The caller asks again soon."""
-        watched = self._watch(capture)
-        if watched.pending is not None and watched.pending.done():
-            if watched.pending.exception() is None:
-                watched.looks, watched.looked = watched.pending.result(), watched.pending_mark
-            watched.pending = None
-        if watched.pending is None and watched.looked != watched.mark:
-            watched.pending_mark = watched.mark
-            watched.pending = self._helper.ask("look", folder=str(capture), is_urgent=True)
-        return watched.looks
+        found = self._looks.about(capture, self._watch(capture).mark, folder=str(capture))
+        return found or {"photos": [], "lights": [], "advice": ""}
 
     def state(self, capture: Path) -> dict[str, Any]:
         """Return the newest verdict, why none can be made, and whether one is being made."""
@@ -158,11 +147,4 @@ class Checks:
 
     def _mark(self, capture: Path) -> str:
         """Return a text that changes with the photos and settings of a capture."""
-        rows = []
-        for path in (*photos_of(capture), *capture.glob("*.toml"), *clips_of(capture)):
-            try:
-                stat = path.stat()
-            except OSError:
-                continue
-            rows.append(f"{path.relative_to(capture)} {stat.st_size} {stat.st_mtime_ns}")
-        return hashlib.sha256("\n".join(rows).encode()).hexdigest()
+        return mark_of(*photos_of(capture), *capture.glob("*.toml"), *clips_of(capture))

@@ -22,7 +22,8 @@ def example_photos() -> Path:
     """
     checkout = Path(__file__).parents[2].joinpath(*PLACE)
     try:
-        installed = [Path(str(file.locate())) for file in distribution("shadowgraph").files or () if _is_it(file.parts)]
+        files = distribution("shadowgraph").files or ()
+        installed = [Path(str(file.locate())) for file in files if file.parts[-len(PLACE) :] == PLACE]
     except PackageNotFoundError:
         installed = []
     for settings in (checkout, *installed):
@@ -36,7 +37,3 @@ def example_page() -> bytes | None:
     """Return the page of the example's result; None where it is of another version of the stage."""
     pack = opened_pack(RESULT)
     return None if pack is None else page_html("Spot", pack).encode()
-
-
-def _is_it(parts: tuple[str, ...]) -> bool:
-    return parts[-len(PLACE) :] == PLACE

@@ -3,11 +3,13 @@
 What was deleted: moved aside within the studio's folder, put back on request, gone once the trash is emptied.
 """
 
+import contextlib
 import os
 import secrets
 import shutil
 import time
 from dataclasses import asdict, dataclass
+from hashlib import sha256
 from pathlib import Path
 
 from capture.errors import CaptureError, UserError
@@ -114,11 +116,7 @@ class StudioFolder:
         Raises:
             CaptureError: there is none.
         """
-        path = self.captures().get(key)
-        if path is None:
-            kind = "a run, a capture was needed" if key in self.runs() else "no capture here; it was moved or deleted"
-            raise CaptureError(f"{key[:80]!r} is {kind}. Go back to all captures.")
-        return path
+        return _found(key, self.captures(), "capture", self.runs(), "run")
 
     def run(self, key: str) -> Path:
         """Return the run with this key.
@@ -126,12 +124,7 @@ class StudioFolder:
         Raises:
             CaptureError: there is none.
         """
-        path = self.runs().get(key)
-        if path is None:
-            is_one = key in self.captures()
-            kind = "a capture, a run was needed: start one there" if is_one else "no run here; it was moved or deleted"
-            raise CaptureError(f"{key[:80]!r} is {kind}. Go back to all captures.")
-        return path
+        return _found(key, self.runs(), "run", self.captures(), "capture")
 
     def key(self, path: Path) -> str:
         """Return the path of a capture or run relative to the folder."""
@@ -209,6 +202,21 @@ class StudioFolder:
         return [path for path in found[:MOST_FOLDERS] if path.resolve().is_relative_to(self.root)]
 
 
+def mark_of(*paths: Path) -> str:
+    """Return a name that changes with the sizes and times of these files; "" where none is there."""
+    rows = []
+    for path in paths:
+        with contextlib.suppress(OSError):
+            stat = path.stat()
+            rows.append(f"{path} {stat.st_size} {stat.st_mtime_ns}")
+    return sha256("\n".join(rows).encode("utf-8", "surrogateescape")).hexdigest()[:24] if rows else ""
+
+
+def without_folder(text: str, folder: Path, called: str = "this folder") -> str:
+    """Return a sentence with the names of files without this folder: where it lies is the studio's machine's alone."""
+    return text.replace(f"{folder}{os.sep}", "").replace(str(folder), called)
+
+
 def is_run(folder: Path) -> bool:
     """Return whether a folder holds a run, by its names."""
     return (folder / MANIFEST).is_file() or (folder / LOG).is_file()
@@ -220,6 +228,13 @@ def is_capture(folder: Path) -> bool:
         return looks_like_capture(folder)
     except (OSError, UserError):
         return False
+
+
+def _found(key: str, places: dict[str, Path], kind: str, others: dict[str, Path], other: str) -> Path:
+    if key in places:
+        return places[key]
+    is_what = f"a {other}, a {kind} was needed" if key in others else f"no {kind} here; it was moved or deleted"
+    raise CaptureError(f"{key[:80]!r} is {is_what}. Go back to all captures.")
 
 
 def _made(path: Path) -> Path:

@@ -7,6 +7,7 @@ for long is ended, which gives its memory back.
 
 import inspect
 import json
+import math
 import subprocess
 import sys
 import threading
@@ -17,16 +18,26 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-from capture.errors import CaptureError
+from capture.errors import CaptureError, Remedy, UserError
 from capture.files.atomic import parse_json
 from reconstruct.run.batch import start_command
-from viewer.studio.words import in_page_words
 
 PROGRAM = (sys.executable, "-m", "viewer.studio.tasks")
 IDLE_S = 120.0  # after which a helper is ended
 LONGEST_ANSWER = 8 << 20  # bytes
 GONE = "the helper process ended before it had answered; often the system ends it, for want of memory. Try again."
 CANCELLED = "Cancelled."
+BUTTONS = {  # of the page, for the remedies of an error; "": the page has no way to do it
+    Remedy.NAME_BOARD: 'choose the board under "Board"',
+    Remedy.BOARD_PHOTO: 'choose "board" below the picture that shows it',
+    Remedy.LIGHTS_FILE: "drop a file of lights with the photos",
+    Remedy.GROUND: "",
+    Remedy.COARSER: 'start "A first look"',
+    Remedy.OTHER_SEED: "start another run",
+    Remedy.START_AGAIN: "",
+    Remedy.OTHER_FOLDER: "start another run",
+    Remedy.PACK_FAULT: "",
+}
 
 
 class Task(Future[Any]):
@@ -140,6 +151,39 @@ class Helper:
             for pipe in (process.stdin, process.stdout):
                 if pipe is not None:
                     pipe.close()
+
+
+class Newest:
+    """The newest answers of one kind of task, by what each is about: asked for anew once that has changed."""
+
+    def __init__(self, helper: Helper, task: str, pause_s: float = 0.0):
+        """Ask nothing yet; `pause_s` is between two answers about the same."""
+        self._helper, self._task, self._pause_s = helper, task, pause_s
+        self._pending: dict[Any, tuple[Task, str]] = {}
+        self._answers: dict[Any, tuple[Any, str, float]] = {}  # and the mark that it is of, and when by our clock
+
+    def about(self, key: Any, mark: str, **arguments: Any) -> Any:
+        """Return the newest answer, None where there is none yet, and ask for one of this mark. The caller comes again.
+
+        Args:
+            mark: changes with the answer; "": there is nothing to ask for.
+        """
+        answer, before, when = self._answers.get(key, (None, "", -math.inf))
+        task, asked = self._pending.get(key, (None, ""))
+        if task is not None and task.done():
+            self._pending.pop(key, None)  # another request may have been here
+            if task.exception() is None:
+                answer, before = task.result(), asked
+            when = time.monotonic()
+            self._answers[key], task = (answer, before, when), None
+        if task is None and mark not in ("", before) and time.monotonic() - when >= self._pause_s:
+            self._pending[key] = self._helper.ask(self._task, is_urgent=True, **arguments), mark
+        return answer
+
+
+def in_page_words(error: Exception) -> str:
+    """Return the text of an error with the buttons of the page for what is to be done."""
+    return error.worded(lambda one: BUTTONS.get(one, one.value)) if isinstance(error, UserError) else str(error)
 
 
 def answer_lines(tasks: dict[str, Callable[..., Any]]) -> None:

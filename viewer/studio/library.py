@@ -1,10 +1,14 @@
 """Library: the cards of the studio's first page, and all that is known of one capture or run."""
 
+import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from capture.errors import UserError
 from capture.files.regular import is_regular
@@ -15,13 +19,13 @@ from capture.session.skipped import clips_of, folder_role, photos_of
 from reconstruct.run.queue import FAILED, FINISHED, RUNNING, STOPPED, WAITING, Job, Queue
 from reconstruct.run_folder.folder import LOG
 from reconstruct.stored_run.documents import CHECK, REPORT, read_check, read_manifest, read_report
-from viewer.display.run_follower import RunFollower, Status, status
+from reconstruct.stored_run.maps import THUMBS
+from viewer.display.run_follower import PREVIEW, RunFollower, Status, size_text, status
 from viewer.studio.checking import Checks
-from viewer.studio.folder import StudioFolder
-from viewer.studio.live_pages import mark_of
-from viewer.studio.words import without_folder
+from viewer.studio.folder import StudioFolder, mark_of, without_folder
 
-PRESETS = ("draft", "standard", "fine", "paper")
+OF_CAPTURE = re.compile(r"(-(draft|standard|fine|paper)(-\d+)?)?")  # what a run's name has behind its capture's
+MOST_DOCUMENTS = 1000  # of runs, that stay in memory
 ARRIVING_S = 4.0  # after the last photo, the capture still counts as arriving
 
 ROLES = {
@@ -40,7 +44,6 @@ class Library:
         """Read nothing yet."""
         self.folder, self._queue, self._parts, self._checks = folder, queue, parts, checks
         self._followers: dict[Path, RunFollower] = {}
-        self._documents: dict[Path, tuple[tuple[int, int], dict[str, Any]]] = {}
 
     def cards(self) -> list[dict[str, Any]]:
         """Return a card for each capture with its runs, and for each run whose capture is not here; newest first."""
@@ -53,7 +56,7 @@ class Library:
                 rows[key] = self.run_row(key, path, job)
         cards = []
         for key, path in captures.items():
-            mine = [name for name, row in rows.items() if self._belongs(path, self.folder.root / name, row, asked)]
+            mine = [name for name in rows if self._belongs(path, self.folder.root / name, asked)]
             own = sorted((rows.pop(name) for name in mine), key=lambda row: -row["date"])
             cards.append(self._card(key, path, own))
         for key, row in rows.items():
@@ -102,12 +105,13 @@ class Library:
         now = status(follower.log(), is_running, max(0.0, since))
         if began is not None:  # taken up again, its log counts from an earlier start
             now = replace(now, elapsed_s=max(now.elapsed_s, time.time() - began))
-        report = self._document(path / REPORT, read_report)
-        manifest = self._document(path / "manifest.json", read_manifest)
-        check = self._document(path / CHECK, read_check)
+        report = _document(path / REPORT, read_report)
+        manifest = _document(path / "manifest.json", read_manifest)
+        check = _document(path / CHECK, read_check)
         preset = str((manifest.get("config") or {}).get("preset") or (job.preset if job else ""))
         mesh = report.get("mesh") or {}
         state, sentence = _state(job, is_running, now)
+        extents = mesh.get("size") if state == FINISHED else None
         if job is not None:
             sentence = without_folder(sentence, Path(job.task.capture), "this capture")
         return {
@@ -120,11 +124,10 @@ class Library:
             "preset": preset,
             "verdict": check.get("verdict", ""),
             "verdict_sentence": check.get("sentence", ""),
-            "size": mesh.get("size") if state == FINISHED else None,
-            "unit": report.get("unit", "mm"),
+            "size": size_text(np.array(extents, float), str(report.get("unit", "mm"))) if extents else "",
             "scale": str(report.get("scale", "")),
             "guessed": ((mesh.get("evidence") or {}).get("unconstrained") or {}).get("share"),
-            "growing": mark_of(path) if state == RUNNING else "",
+            "growing": growing_mark(path) if state == RUNNING else "",
             "warnings": report.get("warnings", [])[:20],
             "date": changed,
             "has_report": is_regular(path / "report.html"),
@@ -158,26 +161,30 @@ class Library:
             "runs": runs,
         }
 
-    def _belongs(self, capture: Path, run: Path, row: dict[str, Any], asked: dict[Path, Job]) -> bool:
+    def _belongs(self, capture: Path, run: Path, asked: dict[Path, Job]) -> bool:
         """Return whether a run is of a capture: as the queue knows, or by the names that studio and command give."""
         job = asked.get(run)
         if job is not None:
             return Path(job.task.capture) == capture
-        stem, _, preset = run.name.partition("-") if "-" in run.name else (run.name, "", "")
-        is_named = run.name == capture.name or (run.name.startswith(f"{capture.name}-") and row["preset"] in run.name)
-        return is_named or (stem == capture.name and preset in PRESETS)
+        return run.name.startswith(capture.name) and OF_CAPTURE.fullmatch(run.name[len(capture.name) :]) is not None
 
-    def _document(self, path: Path, read: Any) -> dict[str, Any]:
-        """Return a JSON document of a run, read when it has changed; empty where it is missing or damaged."""
-        try:
-            stat = path.stat()
-            mark = (stat.st_mtime_ns, stat.st_size)
-            known = self._documents.get(path)
-            if known is None or known[0] != mark:
-                self._documents[path] = known = (mark, read(path))
-            return known[1]
-        except (OSError, UserError):
-            return {}
+
+def growing_mark(run: Path) -> str:
+    """Return a text that changes with what a picture of a run under way shows; "" where there is nothing to show."""
+    return mark_of(run / PREVIEW) or mark_of(run / THUMBS)
+
+
+@lru_cache(MOST_DOCUMENTS)
+def _read(path: Path, read: Callable[[Path], dict[str, Any]], _mark: str) -> dict[str, Any]:
+    try:
+        return read(path)
+    except (OSError, UserError):
+        return {}
+
+
+def _document(path: Path, read: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
+    """Return a JSON document of a run, read when it has changed; empty where it is missing or damaged."""
+    return _read(path, read, mark_of(path))
 
 
 def _time_of(path: Path) -> float:
@@ -217,8 +224,7 @@ def counts_of(photos: Sequence[Mapping[str, Any]], check: Mapping[str, Any]) -> 
 
     Returns:
         `words`, whose numbers add up; `lit`, photos under the flashlight, and `used`, how many of them a run will use;
-        `left_out`, photos of any role that it will not use; `start`, what the button says that starts one;
-        `uses`, the sentence beside it.
+        `start`, what the button says that starts one; `uses`, the sentence beside it.
     """
     numbers = {} if check.get("is_old") else check.get("numbers", {})
     lit = [photo for photo in photos if photo["role"] == "lit"]
@@ -234,7 +240,7 @@ def counts_of(photos: Sequence[Mapping[str, Any]], check: Mapping[str, Any]) -> 
     start = "Start" if not left_out else f"Leave {'it' if left_out == 1 else left_out} out and go on"
     uses = f"{used} of {total} {_photos(total)} under the flashlight will be used." if total and not unseen else ""
     words = f"{len(photos)} {_photos(len(photos))}" + (f": {', '.join(told)}" if told else "")
-    return {"words": words, "lit": total, "used": used, "left_out": left_out, "start": start, "uses": uses}
+    return {"words": words, "lit": total, "used": used, "start": start, "uses": uses}
 
 
 def _photos(count: int) -> str:

@@ -3,18 +3,16 @@
 Videos take minutes: they have a process of their own, so that other files are made meanwhile.
 """
 
-import contextlib
 import shutil
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from capture.errors import CaptureError
 from capture.files.regular import is_own_folder, is_regular
 from capture.files.title import TITLE, title_of
-from viewer.report.formats import FORMATS
-from viewer.studio.folder import StudioFolder
+from viewer.stage.page import FORMATS
+from viewer.studio.folder import StudioFolder, mark_of
 from viewer.studio.helper import Helper, Task
 
 MADE_OF = ("mesh.ply", "fields.safetensors", "detail.safetensors", "stage.json", TITLE)  # what an export shows
@@ -33,13 +31,14 @@ class Asked:
     task: Task
 
     def row(self) -> dict[str, Any] | None:
-        """Return what has become of it, as `Saving.ask` does, with `error`; None: it was removed with the trash."""
+        """Return what has become of it, see `Saving.asked`; None: it was removed with the trash."""
+        row = {"name": self.name, "size": self.size, "title": FORMATS[self.name].title, "error": "", "file": ""}
         if not self.task.done():
-            return {"file": "", "about": "", "share": self.task.share, "error": ""}
+            return row | {"about": "", "share": self.task.share}
         if error := self.task.exception():
-            return {"file": "", "about": "", "share": None, "error": str(error)}
+            return row | {"about": "", "share": None, "error": str(error)}
         made = self.task.result()
-        return made | {"share": 1.0, "error": ""} if is_regular(self.out / made["file"]) else None
+        return row | made | {"share": 1.0} if is_regular(self.out / made["file"]) else None
 
 
 class Saving:
@@ -62,20 +61,20 @@ class Saving:
         rows = FORMATS.items()
         return [{"name": n, "title": r.title, "about": r.about, "sized": "print_size" in r.takes} for n, r in rows]
 
-    def ask(self, key: str, name: str, size: str) -> dict[str, Any]:
-        """Return the file made of a run as it is now, and begin to make it where it is not there yet.
+    def ask(self, key: str, name: str, size: str) -> None:
+        """Begin to make a file of a run as it is now, where it is not there or being made.
 
         Args:
             size: longest side of a solid to print, mm; "" for the object's own.
 
-        Returns:
-            `file`, its name, "" while it is made; `about`, what it holds, in words; `share` that is done, null where
-            that is not known.
-
         Raises:
-            CaptureError: there is no such run or format, or it could not be made; the sentence says why.
+            CaptureError: there is no such run or format.
         """
-        return self._answer(key, name, size)[1]
+        out, arguments = self._request(key, name, size)
+        row = self._row(out)
+        if row is None or row["error"]:
+            helper = self._films if "frames" in FORMATS[name].takes else self._files
+            self._asked[out] = Asked(key, name, size, out, helper, helper.ask("save", **arguments))
 
     def file(self, key: str, name: str, size: str) -> Path:
         """Return a file that was made.
@@ -83,17 +82,21 @@ class Saving:
         Raises:
             CaptureError: it was not made, or the run has changed since.
         """
-        out, found = self._answer(key, name, size)
-        if not found["file"]:
-            raise CaptureError("This file is still being made.")
-        return out / found["file"]
+        out, _ = self._request(key, name, size)
+        row = self._row(out)
+        if row is None or not row["file"]:
+            raise CaptureError("This file is not there. Make it first.")
+        return out / row["file"]
 
     def asked(self, key: str) -> list[dict[str, Any]]:
-        """Return the files asked for of a run as it is now: as `ask`, with `name`, `size`, `title` and `error`."""
+        """Return the files asked for of a run as it is now.
+
+        Each has `name`, `size` and `title`; `file`, its name, "" while it is made; `about`, what it holds, in words;
+        `share` that is done, null where that is not known; `error`, why it could not be made.
+        """
         now = [one for one in list(self._asked.values()) if one.key == key]
         now = [one for one in now if self._request(key, one.name, one.size)[0] == one.out]
-        known = [(row, one) for one in now if (row := one.row()) is not None]
-        return [row | {"name": one.name, "size": one.size, "title": FORMATS[one.name].title} for row, one in known]
+        return [row for one in now if (row := one.row()) is not None]
 
     def forget(self, key: str, name: str, size: str) -> None:
         """Cancel a file that is being made, or remove one that was made."""
@@ -103,18 +106,6 @@ class Saving:
             one.helper.cancel(one.task)
             one.task.add_done_callback(lambda _: shutil.rmtree(out, ignore_errors=True))
 
-    def _answer(self, key: str, name: str, size: str) -> tuple[Path, dict[str, Any]]:
-        out, arguments = self._request(key, name, size)
-        row = self._asked[out].row() if out in self._asked else None
-        if row is not None and row["error"]:
-            self._asked.pop(out, None)  # asked anew, it is tried again
-            raise CaptureError(row["error"])
-        if row is None:
-            helper = self._films if "frames" in FORMATS[name].takes else self._files
-            self._asked[out] = Asked(key, name, size, out, helper, helper.ask("save", **arguments))
-            row = {"file": "", "about": "", "share": None}
-        return out, row
-
     def clear(self) -> None:
         """Remove what was made; each can be made again."""
         if is_own_folder(self._place):
@@ -122,30 +113,20 @@ class Saving:
                 if place not in self._asked or self._asked[place].task.done():
                     shutil.rmtree(place, ignore_errors=True)
 
+    def _row(self, out: Path) -> dict[str, Any] | None:
+        one = self._asked.get(out)
+        return None if one is None else one.row()
+
     def _request(self, key: str, name: str, size: str) -> tuple[Path, dict[str, Any]]:
         """Return the folder for a file, whose name changes with what it is made of, and the task that makes it."""
-        run = self._finished(key)
-        if name not in FORMATS:
-            raise CaptureError(f"{name!r:.40} is no kind of file that can be made.")
-        longest = _number(size) if "print_size" in FORMATS[name].takes else None
-        marks = [f"{run} {name} {longest}"]
-        for part in MADE_OF:
-            with contextlib.suppress(OSError):
-                stat = (run / part).stat()
-                marks.append(f"{part} {stat.st_size} {stat.st_mtime_ns}")
-        out = self._place / sha256("\n".join(marks).encode()).hexdigest()[:24]
-        return out, {"run": str(run), "name": name, "out": str(out), "print_size": longest}
-
-    def _finished(self, key: str) -> Path:
-        """Return the folder of a finished run.
-
-        Raises:
-            CaptureError: there is none, or it has no result.
-        """
         run = self._folder.run(key)
         if not is_regular(run / "mesh.ply"):
             raise CaptureError(f"{title_of(run)} has no result yet that could be saved.")
-        return run
+        if name not in FORMATS:
+            raise CaptureError(f"{name!r:.40} is no kind of file that can be made.")
+        longest = _number(size) if "print_size" in FORMATS[name].takes else None
+        out = self._place / f"{name}-{longest}-{mark_of(*(run / part for part in MADE_OF))}"
+        return out, {"run": str(run), "name": name, "out": str(out), "print_size": longest}
 
 
 def _number(size: str) -> float | None:

@@ -12,6 +12,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from calibration.board.board import parse_board
 from capture.decode.formats import read_size
 from capture.errors import CaptureError, UserError
 from capture.files.regular import is_regular
@@ -21,23 +22,22 @@ from capture.intake.parts import Parts
 from capture.session.skipped import clips_of, photos_of
 from capture.session.write_settings import set_entry, set_role
 from reconstruct.run.batch import PROGRAM, Task
-from reconstruct.run.queue import FINISHED, RUNNING, Job, Queue
-from viewer.stage.files import StageFiles
-from viewer.studio.boards import checked_spec
+from reconstruct.run.queue import RUNNING, Job, Queue
+from reconstruct.stored_run.stage_pack import StagePack
+from viewer.stage.page import kept_pack
 from viewer.studio.checking import Checks
 from viewer.studio.example import TITLE, example_photos
-from viewer.studio.folder import StudioFolder, Trash
-from viewer.studio.helper import Helper
-from viewer.studio.library import Library
-from viewer.studio.live_pages import Growing, LivePages
+from viewer.studio.folder import StudioFolder, Trash, mark_of
+from viewer.studio.helper import Helper, Newest
+from viewer.studio.library import Library, growing_mark
+from viewer.studio.live_pages import LivePages
 from viewer.studio.saving import Saving
 
 TICK_S = 0.5
 LEAVING_S = 5.0  # that a step may take to its end when the studio closes; files that are cut off go on the next time
-PICTURE_PX, RUN_PICTURE_PX = 320, 640
+PICTURE_PX = 320
+GROWING_PAUSE_S = 4.0  # between two pictures of a run under way: each takes some tenths of a CPU second
 USUAL = (36, 4032, 3024)  # photos, and their px, where none are there yet: a phone's
-MOST_MEASURED = 8  # captures whose predicted costs are kept
-MOST_STAGES = 4  # runs whose stages stay in memory: each takes a few megabytes
 PRESETS = ("draft", "standard", "fine")
 REPORT_PAGE = "report.html"
 ACTIONS = ("stop", "first", "again")  # of the queue
@@ -62,17 +62,13 @@ class Studio:
         self.library = Library(folder, self.queue, self.parts, self.checks)
         self.trash = Trash(folder.root)
         self.pages = LivePages(folder)
-        self.growing = Growing(folder, self.thumbnails)
+        self._growing = Newest(self.thumbnails, "growing", GROWING_PAUSE_S)
         self.saving = Saving(folder)
         self._lock, self._ended = threading.RLock(), threading.Event()
-        self._measured: dict[tuple[int, int, int], Future[Any]] = {}  # for so many photos, of this size
-        self._costs: dict[str, dict[str, Any]] = {}  # of jobs, as predicted when they were first shown
-        self._stages: dict[Path, StageFiles] = {}
-        self._stage_lock = threading.Lock()
-        self._prepared = {job.id for job in self.queue.jobs if job.state == FINISHED}
+        self._presets = Newest(self.pictures, "presets")
         self._faults: dict[str, str] = {}  # the newest of each step
         arriving = (contextlib.nullcontext(), self.parts.try_again)  # an archive takes minutes and holds nothing up
-        working = (self._lock, self.queue.tick, self.checks.tick, self._prepare_results)
+        working = (self._lock, self.queue.tick, self.checks.tick)
         self._threads = [
             threading.Thread(target=self._keep_going, args=steps, daemon=True) for steps in (arriving, working)
         ]
@@ -116,39 +112,27 @@ class Studio:
 
     def presets(self, key: str) -> dict[str, Any]:
         """Return time and memory of each preset for a capture on this machine; empty until they are measured."""
-        photos = photos_of(self.folder.capture(key)) if key else []
+        photos = photos_of(self.folder.capture(key))
         try:
             size = read_size(photos[-1]) if photos else USUAL[1:]
         except UserError:
             size = USUAL[1:]
         count = max(len(photos), 12) if photos else USUAL[0]
-        asked = (count, size[0], size[1])
-        future = self._measured.get(asked)
-        if future is None:
-            future = self.pictures.ask("presets", is_urgent=True, photos=count, width=size[0], height=size[1])
-            self._measured = dict([*self._measured.items(), (asked, future)][-MOST_MEASURED:])
-        if not future.done():
-            return {"presets": []}
-        if future.exception() is not None:
-            self._measured.pop(asked, None)  # asked again the next time
-            return {"presets": []}
-        return {"presets": future.result()}
+        asked = {"photos": count, "width": size[0], "height": size[1]}
+        return {"presets": self._presets.about(tuple(asked.values()), "measured", **asked) or []}
 
     def _queued(self, job: Job, row: dict[str, Any] | None) -> dict[str, Any]:
         """Return what the queue on the first page shows of a job: its cost, and the seconds left."""
-        preset = job.preset
-        if job.id not in self._costs:
-            found: list[dict[str, Any]] = []
-            with contextlib.suppress(CaptureError):
-                found = self.presets(self.folder.key(Path(job.task.capture)))["presets"]
-            self._costs.update((job.id, one) for one in found if one["name"] == preset)
-        cost = self._costs.get(job.id, {})
+        found: list[dict[str, Any]] = []
+        with contextlib.suppress(CaptureError):  # the capture may have gone
+            found = self.presets(self.folder.key(Path(job.task.capture)))["presets"]
+        cost = next((one for one in found if one["name"] == job.preset), {})
         key, left = self.folder.key(job.run), cost.get("seconds")
         if row is not None and job.state == RUNNING:
             now = row["progress"]
             left = now["left_s"] if now["left_s"] is not None else left and max(0.0, left - now["elapsed_s"])
         title = row["title"] if row is not None else title_of(job.run, Path(job.task.capture))
-        known = {"id": job.id, "run": key, "title": title, "state": job.state, "preset": preset}
+        known = {"id": job.id, "run": key, "title": title, "state": job.state, "preset": job.preset}
         return known | {"left_s": left, "bytes": cost.get("bytes")}
 
     def picture(self, key: str, photo: str) -> "Path | Future[Any]":
@@ -164,40 +148,27 @@ class Studio:
         if photo not in photos:
             raise CaptureError("This photo is gone.")
         path = photos[photo]
-        out = self._kept_picture(path, path)
+        out = self.folder.kept / "pictures" / f"{mark_of(path)}.jpg"
         if is_regular(out):
             return out
         return self.thumbnails.ask("thumbnail", photo=str(path), out=str(out), long_side=PICTURE_PX)
 
-    def run_picture(self, key: str) -> "Path | Future[Any]":
-        """Return the small picture of a finished run, or the task that makes it."""
-        run = self.folder.run(key)
-        out = self._kept_picture(run, run / "mesh.ply")
-        if is_regular(out):
-            return out
-        return self.pictures.ask("run_picture", run=str(run), out=str(out), width=RUN_PICTURE_PX)
+    def run_picture(self, key: str) -> "bytes | Future[Any]":
+        """Return the small picture of a finished run, which its stage begins with, or the task that packs the stage."""
+        pack = self.stage(key)
+        return pack if isinstance(pack, Future) else pack.read(pack.facts["addresses"]["first"])
 
-    def stage(self, key: str) -> "StageFiles | Future[Any]":
-        """Return the stage of a finished run, or the task that packs it where the run has not done so."""
+    def growing_picture(self, key: str) -> Path | None:
+        """Return the newest picture of a run under way, and ask for the next one; None where there is none yet."""
         run = self.folder.run(key)
-        spare = self._kept_picture(run, run / "mesh.ply").with_suffix(".zip")
-        with self._stage_lock:
-            files = self._stages.pop(run, None) or StageFiles(run, "frame", spare=spare)
-            self._stages[run] = files
-            while len(self._stages) > MOST_STAGES:
-                self._stages.pop(next(iter(self._stages)))
-        if files.is_packed():
-            return files
-        return self.pictures.ask("pack", run=str(run), out=str(spare), is_urgent=True)
+        out = self.folder.kept / "pictures" / f"growing-{sha256(key.encode()).hexdigest()[:24]}.jpg"
+        is_made = self._growing.about(run, growing_mark(run), run=str(run), out=str(out))
+        return out if is_made and is_regular(out) else None
 
-    def _kept_picture(self, what: Path, file: Path) -> Path:
-        """Return where the picture of something is kept, under a name that changes with `file`."""
-        try:
-            stat = file.stat()
-        except OSError as error:
-            raise CaptureError(f"{title_of(what)} has no result yet that could be shown.") from error
-        name = sha256(f"{what} {stat.st_size} {stat.st_mtime_ns}".encode()).hexdigest()[:24]
-        return self.folder.kept / "pictures" / f"{name}.jpg"
+    def stage(self, key: str) -> "StagePack | Future[Any]":
+        """Return the packed stage of a finished run, or the task that packs it where the run has not done so."""
+        run = self.folder.run(key)
+        return kept_pack(run) or self.pictures.ask("pack", run=str(run), is_urgent=True)
 
     def for_phone(self, key: str) -> dict[str, Any]:
         """Return what a phone that was let in may know of the capture that it sends to."""
@@ -273,7 +244,7 @@ class Studio:
 
     def set_board(self, key: str, spec: str) -> None:
         """Say which board the photos show."""
-        set_entry(self.folder.capture(key), "board", checked_spec(spec) or None)
+        set_entry(self.folder.capture(key), "board", parse_board(spec).spec() if spec else None)
 
     def set_role(self, key: str, photo: str, role: str) -> None:
         """Say what a photo is."""
@@ -305,17 +276,6 @@ class Studio:
 
     def _find(self, key: str) -> Path:
         return self.folder.run(key) if key in self.folder.runs() else self.folder.capture(key)
-
-    def _prepare_results(self) -> None:
-        """Make picture and page of runs that have just finished, so that they are there when somebody looks."""
-        finished = {job.id for job in self.queue.jobs if job.state == FINISHED}
-        for job in self.queue.jobs:
-            if job.id in finished - self._prepared and (job.run / "mesh.ply").is_file():
-                key = self.folder.key(job.run)
-                with contextlib.suppress(CaptureError):
-                    self.stage(key)
-                    self.run_picture(key)
-        self._prepared |= finished
 
     def _refuse(self, task: Task) -> None:
         refuse_full_disk(0, Path(task.out) if Path(task.out).is_dir() else self.folder.root)

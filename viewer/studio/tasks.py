@@ -10,31 +10,24 @@ from math import ceil, sqrt
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
 
 from capture.decode.exif import orientation_of
 from capture.decode.formats import read_exif
 from capture.files.atomic import atomic_file
-from capture.photos.photo import JPEG_QUALITY, encode_srgb, read_thumbnail
+from capture.photos.photo import JPEG_QUALITY, read_thumbnail
 from reconstruct.check.coach import Coach
-from reconstruct.stored_run.maps import THUMBS, read_thumbnails
-from reconstruct.stored_run.ply import Triangles
+from reconstruct.stored_run.maps import read_thumbnails
+from reconstruct.stored_run.ply import Triangles, read_preview
 from reconstruct.stored_run.stored_run import CALIBRATION
+from viewer.display.run_follower import PREVIEW, RunFollower
 from viewer.studio.helper import answer_lines
 
-TURNED = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}  # EXIF orientation: how a photo is shown; nothing but these small pictures is turned
+ORIENTATION = ExifTags.Base.Orientation
 MOST_LOOKS = 4  # captures whose small photos stay in memory
 MOST_SHOWN = 64  # photos of a run on one sheet
 GROWING_PX = (640, 480)  # of a run under way
-DARK = (24, 26, 31)  # behind it
+DARK, GAP = (24, 26, 31), 4  # behind it, and px between photos
 _looks: dict[str, Coach] = {}
 
 
@@ -42,8 +35,8 @@ def thumbnail(photo: str, out: str, long_side: int) -> None:
     """Write a small JPEG of a photo."""
     path = Path(photo)
     picture = Image.fromarray(read_thumbnail(path, long_side))
-    turn = TURNED.get(orientation_of(read_exif(path)))
-    _save(picture if turn is None else picture.transpose(turn), Path(out))
+    picture.getexif()[ORIENTATION] = orientation_of(read_exif(path))
+    _save(ImageOps.exif_transpose(picture), Path(out))  # nothing but these small pictures is turned
 
 
 def look(folder: str) -> dict[str, Any]:
@@ -64,41 +57,24 @@ def presets(photos: int, width: int, height: int) -> list[dict[str, Any]]:
     return predicted_runs(photos, width, height)
 
 
-def run_picture(run: str, out: str, width: int) -> None:
-    """Write a small picture of a finished run: the object under a soft lamp."""
-    import numpy as np
-
-    from reconstruct.render.studio import studio_of, turntable
-    from reconstruct.stored_run.stored_run import StoredRun
-
-    stored = StoredRun(Path(run))
-    picture = next(iter(turntable(stored.fields, studio_of(np.asarray(stored.mesh.bounds)), width, 1)))
-    _save(Image.fromarray(encode_srgb(picture)), Path(out))
-
-
-def growing(run: str, out: str) -> None:
-    """Write a picture of a run under way: the surface as it is now, or the photos that it has read."""
-    from reconstruct.stored_run.ply import read_preview
-    from viewer.display.run_follower import PREVIEW
-
+def growing(run: str, out: str) -> bool:
+    """Write a picture of a run under way: the surface as it is now, or the photos that it has read; say so."""
     folder = Path(run)
     surface = read_preview(folder / PREVIEW)
     picture = _contact_sheet(folder) if surface is None else _surface_picture(folder, surface)
     _save(picture, Path(out))
+    return True
 
 
 def _contact_sheet(run: Path) -> Image.Image:
     """Return the small photos of a run side by side, in the order of their names."""
-    names = sorted(path.name for path in (run / THUMBS).glob("*.jpg"))[:MOST_SHOWN]
-    photos = read_thumbnails(run, names)
+    photos = read_thumbnails(run, RunFollower(run).thumbnails()[:MOST_SHOWN])
     columns = max(1, ceil(sqrt(len(photos))))
     width, height = GROWING_PX[0] // columns, GROWING_PX[1] // columns
     sheet = Image.new("RGB", GROWING_PX, DARK)
     for number, photo in enumerate(photos.values()):
-        small = Image.fromarray(photo)
-        small.thumbnail((width - 4, height - 4))
-        corner = (number % columns * width, number // columns * height)
-        sheet.paste(small, (corner[0] + (width - small.width) // 2, corner[1] + (height - small.height) // 2))
+        small = ImageOps.pad(Image.fromarray(photo), (width - GAP, height - GAP), color=DARK)
+        sheet.paste(small, (number % columns * width, number // columns * height))
     return sheet
 
 
@@ -122,7 +98,7 @@ def save(
 ) -> dict[str, str]:
     """Write a finished run as another kind of file into the folder `out`; return the file's name and what it holds."""
     from reconstruct.export.export import ExportOptions, as_one_file, default_file, export
-    from viewer.report.formats import FORMATS
+    from viewer.stage.page import FORMATS
 
     assert name in FORMATS
     folder = Path(out)
@@ -143,11 +119,11 @@ def report(run: str) -> None:
     write_report(Path(run))
 
 
-def pack(run: str, out: str) -> None:
+def pack(run: str) -> None:
     """Pack the stage of a finished run that holds none."""
-    from viewer.stage.pack_file import write_stage
+    from viewer.stage.page import write_stage
 
-    write_stage(Path(run), Path(out))
+    write_stage(Path(run))
 
 
 def _save(picture: Image.Image, out: Path) -> None:
@@ -155,7 +131,7 @@ def _save(picture: Image.Image, out: Path) -> None:
         picture.convert("RGB").save(temporary, "JPEG", quality=JPEG_QUALITY)
 
 
-TASKS = {task.__name__: task for task in (thumbnail, look, presets, run_picture, growing, save, pack, report)}
+TASKS = {task.__name__: task for task in (thumbnail, look, presets, growing, save, pack, report)}
 
 if __name__ == "__main__":
     answer_lines(TASKS)

@@ -3,16 +3,18 @@
 The owner's listener is bound to this machine and asks for the token of the printed address all the same, because other
 users of the machine can reach it. The phones' listener has its own secrets, see viewer/studio_server/phones.py.
 
-The studio's own files for browsers are read here, too.
+The studio's own files for browsers are read here, and listeners and servers made.
 """
 
 import errno
+import socket
 from collections.abc import Callable
 from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import uvicorn
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Route
@@ -24,10 +26,12 @@ from capture.files.atomic import parse_json
 from capture.files.names import in_one_line
 from viewer.page.guard import COOKIE, is_own_page, is_same
 from viewer.stage.files import SAFE_HEADERS
-from viewer.studio.words import in_page_words, without_folder
+from viewer.studio.folder import without_folder
+from viewer.studio.helper import in_page_words
 
 WEB = Path(str(resources.files("viewer.studio_server") / "web"))
 TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+FILES = tuple(sorted(file.name for file in WEB.iterdir()))
 REVALIDATE = {"Cache-Control": "no-cache"}
 SAFE = ("GET", "HEAD")
 LONGEST_TEXT = 1000  # letters of a value of a request
@@ -46,6 +50,8 @@ FRAMED_POLICY = (
     "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data: blob:; "
     "frame-ancestors 'self'; base-uri 'none'; form-action 'none'"
 )
+MOST_PORTS = 50  # that are tried, one after the other
+GRACE_S = 3  # for requests under way when a server ends
 NEEDS_ADDRESS = "Open the address that shadowgraph printed, with the token at its end.\n"
 
 
@@ -54,7 +60,7 @@ def web_file(name: str) -> Response:
     return FileResponse(WEB / name, media_type=TYPES[Path(name).suffix], headers=REVALIDATE)
 
 
-def file_routes(names: tuple[str, ...], index: str) -> list[Route]:
+def file_routes(index: str) -> list[Route]:
     """Return a route for each of our files, and / for the page."""
 
     def route(name: str, path: str) -> Route:
@@ -63,7 +69,7 @@ def file_routes(names: tuple[str, ...], index: str) -> list[Route]:
 
         return Route(path, answer, methods=["GET"])
 
-    return [route(index, "/"), *(route(name, f"/{name}") for name in names)]
+    return [route(index, "/"), *(route(name, f"/{name}") for name in FILES)]
 
 
 class Gate:
@@ -74,11 +80,9 @@ class Gate:
         self._app, self._host, self._admits = app, host, admits
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request."""
+        """Answer one request; there is no WebSocket here, and nothing to begin or end."""
         if scope["type"] != "http":
-            if scope["type"] == "lifespan":
-                await self._app(scope, receive, send)
-            return  # there is no WebSocket here
+            return
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -176,3 +180,38 @@ def _as_sentence(root: Path, _request: Request, error: Exception) -> Response:
         hint = "Empty the trash, or make room." if is_full else "Try again; check that the folder can be written to."
         text = f"{error.strerror or error}. {hint}"
     return JSONResponse({"error": in_one_line(text)[:2000]}, status)
+
+
+def free_socket(host: str, port: int) -> socket.socket:
+    """Return a socket that listens on this host and port, or to one of the next ports; port 0: any.
+
+    Raises:
+        UserError: none is free.
+    """
+    kind = socket.AF_INET6 if ":" in host else socket.AF_INET
+    for candidate in range(port, port + MOST_PORTS):
+        listener = socket.socket(kind, socket.SOCK_STREAM)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((host, candidate))
+            listener.listen()  # until then another program may bind it, too
+            return listener
+        except OSError:
+            listener.close()
+    raise UserError(f"none of the ports {port} to {port + MOST_PORTS - 1} of {host} is free. Give another --port.")
+
+
+def http_server(app: ASGIApp, certificate: Path | None = None, key: Path | None = None) -> uvicorn.Server:
+    """Return a server of an application; with a certificate it speaks https."""
+    config = uvicorn.Config(
+        app,
+        log_level="critical",
+        access_log=False,
+        lifespan="off",
+        ws="none",
+        server_header=False,
+        timeout_graceful_shutdown=GRACE_S,
+        ssl_certfile=certificate,
+        ssl_keyfile=key,
+    )
+    return uvicorn.Server(config)

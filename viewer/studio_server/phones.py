@@ -35,7 +35,7 @@ from capture.errors import CaptureError
 from capture.files.atomic import atomic_file, write_json
 from capture.files.names import in_one_line
 from capture.files.schema import Count, Number, Text, read_kept
-from viewer.studio.sockets import free_socket, http_server
+from viewer.studio_server.gate import free_socket, http_server
 
 DAYS = 30
 PRIVATE = 0o600
@@ -50,7 +50,7 @@ LONGEST_NAME = 60  # letters
 
 
 def make_certificate(folder: Path, addresses: list[str]) -> tuple[Path, Path]:
-    """Write a new certificate and its key for these addresses and this machine's names; return both paths.
+    """Write a new certificate and its key for these addresses; return both paths.
 
     Raises:
         OSError: they cannot be written.
@@ -58,7 +58,6 @@ def make_certificate(folder: Path, addresses: list[str]) -> tuple[Path, Path]:
     key = ec.generate_private_key(ec.SECP256R1())
     now = datetime.datetime.now(datetime.UTC)
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Shadowgraph studio on this network")])
-    hosts = [x509.DNSName(host) for host in dict.fromkeys(["localhost", _plain(socket.gethostname())]) if host]
     places = [x509.IPAddress(ipaddress.ip_address(one)) for one in dict.fromkeys(["127.0.0.1", *addresses])]
     certificate = (
         x509.CertificateBuilder()
@@ -68,7 +67,7 @@ def make_certificate(folder: Path, addresses: list[str]) -> tuple[Path, Path]:
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - datetime.timedelta(days=1))
         .not_valid_after(now + datetime.timedelta(days=DAYS))
-        .add_extension(x509.SubjectAlternativeName([*hosts, *places]), critical=False)
+        .add_extension(x509.SubjectAlternativeName(places), critical=False)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
         .sign(key, hashes.SHA256())
@@ -76,22 +75,14 @@ def make_certificate(folder: Path, addresses: list[str]) -> tuple[Path, Path]:
     secret = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
+    public = certificate.public_bytes(serialization.Encoding.PEM)
     folder.mkdir(parents=True, exist_ok=True)
-    for path, content in ((folder / "key.pem", secret), (folder / "certificate.pem", _pem(certificate))):
+    for path, content in ((folder / "key.pem", secret), (folder / "certificate.pem", public)):
         with atomic_file(path) as temporary:
             temporary.touch(PRIVATE)
             temporary.write_bytes(content)
         os.chmod(path, PRIVATE)
     return folder / "certificate.pem", folder / "key.pem"
-
-
-def _pem(certificate: x509.Certificate) -> bytes:
-    return certificate.public_bytes(serialization.Encoding.PEM)
-
-
-def _plain(host: str) -> str:
-    """Return a host's name if a certificate can hold it, else nothing."""
-    return host if host.isascii() and 0 < len(host) < 64 else ""
 
 
 @dataclass(frozen=True)
@@ -208,12 +199,6 @@ class Phones:
             if self._door is not None and phone.secret in self._door.phones:
                 self._door.phones[phone.secret] = replace(phone, role=role)
 
-    def leave(self, secret: str) -> None:
-        """Forget a phone."""
-        with self._lock:
-            if self._door is not None and self._door.phones.pop(secret, None) is not None:
-                self._note()
-
     def shoot(self) -> None:
         """Ask the live cameras for a photo."""
         with self._lock:
@@ -235,15 +220,14 @@ class Phones:
         return {"on": True, "capture": door.capture, "left_s": door.until - now, "phones": phones} | addresses
 
     def addresses(self) -> dict[str, Any]:
-        """Return the addresses of the code, for uploads and for live mode, and those of other networks."""
+        """Return the addresses of the code, for uploads and for live mode."""
         door = self.door
         assert door is not None
-        hosts = own_addresses() or ["127.0.0.1"]
+        host = next(iter(own_addresses()), "127.0.0.1")
         http, https = door.ports
         return {
-            "address": f"http://{hosts[0]}:{http}/#{door.token}",
-            "live_address": f"https://{hosts[0]}:{https}/live#{door.token}",
-            "others": [f"http://{host}:{http}/" for host in hosts[1:]],
+            "address": f"http://{host}:{http}/#{door.token}",
+            "live_address": f"https://{host}:{https}/live#{door.token}",
         }
 
     def code(self, is_live: bool) -> bytes:

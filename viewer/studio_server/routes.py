@@ -1,9 +1,9 @@
-"""The owner's requests: addresses, and what of the Studio answers them."""
+"""The owner's requests: addresses, and what of the Studio answers them; the boards that its page offers."""
 
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import replace
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -13,24 +13,31 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from calibration.board.printing import draw_pdf
+from calibration.board.board import parse_print
+from calibration.board.printing import DEFAULT_BOARDS, PAPERS, BoardPage, draw_pdf, lay_out
 from capture.errors import CaptureError
 from capture.files.regular import is_regular, read_regular
+from reconstruct.stored_run.stage_document import save_stage_document
 from viewer.stage.files import HEADERS, HTML
-from viewer.stage.page import page_policy
-from viewer.studio import boards
+from viewer.stage.page import page_of, page_policy
 from viewer.studio.example import example_page
 from viewer.studio.studio import Studio
 from viewer.studio_server.gate import FRAMED_POLICY, file_routes, read_body, read_object, sentences, text_of
 from viewer.studio_server.phones import Phones
 from viewer.studio_server.uploads import Uploads
 
-OWNER_FILES = ("studio.css", "dom.js", "home.js", "capture.js", "result.js", "board.js", "upload.js", "app.js")
-OWNER_FILES += ("hemisphere.js", "icon.svg", "phones.js", "save.js", "voice.js", "queue.js")
+BOARDS = (  # text of session.toml ("": none), title, about
+    ("", "Find out from the photos", "Common printed boards are tried."),
+    (DEFAULT_BOARDS["charuco"], "Our printed board", "Recognised from all sides and with parts of it hidden."),
+    (DEFAULT_BOARDS["checkerboard"], "Our printed checkerboard", "Fewer fine details; for printers that smear."),
+    ("paper:A4", "A blank sheet of A4", "No printer needed: a clean, flat sheet on a darker table."),
+    ("paper:letter", "A blank sheet of US letter", "No printer needed: a clean, flat sheet on a darker table."),
+    ("card", "A bank card", "No printer needed: for objects not much larger than a hand."),
+)
 SAVED = ("format", "size")  # what a request for another kind of file names beside the run
 LARGEST_PICTURE = 1 << 22  # bytes of a run under way: ours have 100 kB
 STAGED = HEADERS | {  # of a page that runs the stage's script, and saves pictures and notes
-    "Content-Security-Policy": f"sandbox allow-scripts allow-downloads allow-forms; {page_policy(is_served=False)}; "
+    "Content-Security-Policy": f"sandbox allow-scripts allow-downloads allow-forms; {page_policy()}; "
     "frame-ancestors 'self'"
 }
 FRAMED = {"Content-Security-Policy": FRAMED_POLICY, "X-Frame-Options": "SAMEORIGIN"}
@@ -40,7 +47,7 @@ KEPT = {"Cache-Control": "private, max-age=86400"}
 def owner_app(studio: Studio, phones: Phones) -> Starlette:
     """Return the application of the owner's page, without its gate."""
     routes = [
-        *file_routes(OWNER_FILES, "index.html"),
+        *file_routes("index.html"),
         *_questions(studio, phones),
         *_changes(studio, phones),
         *Uploads(
@@ -63,14 +70,14 @@ def _questions(studio: Studio, phones: Phones) -> list[Route]:
         ask("/api/capture", lambda r: studio.capture(_key(r))),
         ask("/api/presets", lambda r: studio.presets(_key(r))),
         ask("/api/folders", lambda r: [{"key": k, "is_capture": c} for k, c in studio.folder.browse(_key(r))]),
-        ask("/api/boards", lambda _: boards.choices()),
-        ask("/api/board_shapes", lambda r: boards.board_shapes(r.query_params.get("board", ""))),
-        ask("/board.pdf", _board_pdf),
+        ask("/api/boards", lambda _: [dict(zip(("spec", "title", "about"), board, strict=True)) for board in BOARDS]),
+        ask("/api/board_shapes", lambda r: _board_shapes(_board_page(r))),
+        ask("/board.pdf", lambda r: Response(draw_pdf(_board_page(r)), media_type="application/pdf")),
         ask("/api/phones", lambda _: phones.row()),
         ask("/api/code", lambda r: Response(phones.code("live" in r.query_params), media_type="image/svg+xml")),
         ask("/api/picture", lambda r: _made(studio.picture(_key(r), r.query_params.get("photo", "")), "image/jpeg")),
         ask("/api/run_picture", lambda r: _made(studio.run_picture(_key(r)), "image/jpeg")),
-        ask("/api/growing", lambda r: _growing(studio.growing.picture(_key(r)))),
+        ask("/api/growing", lambda r: _growing(studio.growing_picture(_key(r)))),
         ask("/api/formats", lambda _: studio.saving.formats()),
         ask("/api/saved", lambda r: studio.saving.asked(_key(r))),
         ask("/download", lambda r: _download(studio.saving.file(_key(r), *(r.query_params.get(n, "") for n in SAVED)))),
@@ -119,14 +126,13 @@ def _changes(studio: Studio, phones: Phones) -> list[Route]:
 
 def _stage(studio: Studio, request: Request) -> Response:
     """Return the stage of a run, which may be a stranger's: without an origin, and it runs its own script alone."""
-    files = studio.stage(request.path_params["key"])
-    if isinstance(files, Future):
-        return _made(files, "")
+    pack = studio.stage(request.path_params["key"])
+    if isinstance(pack, Future):
+        return _made(pack, "")
     if request.method == "HEAD":
         return Response()
-    page = files.get("")
-    assert page is not None
-    return Response(page.content, media_type=page.kind, headers=STAGED)
+    run = studio.folder.run(request.path_params["key"])
+    return Response(page_of(run, pack, "frame"), media_type=HTML, headers=STAGED)
 
 
 def _example() -> Response:
@@ -139,14 +145,7 @@ def _example() -> Response:
 async def _keep_document(studio: Studio, request: Request) -> Response:
     """Keep what a visitor noted on a run's stage with the run."""
     content = await read_body(request)
-
-    def keep() -> None:
-        files = studio.stage(request.path_params["key"])
-        if isinstance(files, Future):
-            raise CaptureError("The picture of this run is still being packed; try again in a moment.")
-        files.save(content)
-
-    await to_thread.run_sync(keep)
+    await to_thread.run_sync(lambda: save_stage_document(studio.folder.run(request.path_params["key"]), content))
     return JSONResponse({"done": None})
 
 
@@ -158,13 +157,25 @@ def _key(request: Request) -> str:
     return request.query_params.get("key", "")
 
 
-def _board_pdf(request: Request) -> Response:
-    page = boards.board_page(request.query_params.get("board", ""), request.query_params.get("paper", "a4"))
-    return Response(draw_pdf(page), media_type="application/pdf")
+def _board_page(request: Request) -> BoardPage:
+    """Lay the board that a request names out on its sheet."""
+    spec, paper = request.query_params.get("board", ""), request.query_params.get("paper", "a4")
+    if paper not in PAPERS:
+        raise CaptureError(f"{paper!r:.40} is no paper; {' or '.join(PAPERS)} was needed.")
+    return lay_out(parse_print(spec or DEFAULT_BOARDS["charuco"]), paper)
 
 
-def _made(found: "Path | Future[Any]", kind: str) -> Response:
+def _board_shapes(page: BoardPage) -> dict[str, Any]:
+    """Return the board's rectangles in mm from the upper left corner of its sheet, with the sheet's size, to draw."""
+    upright = [replace(shape, y=page.height_mm - shape.y - shape.height) for shape in page.rectangles]
+    rows = [[shape.x, shape.y, shape.width, shape.height, int(shape.is_black)] for shape in upright]
+    return {"width": page.width_mm, "height": page.height_mm, "shapes": rows, "spec": page.board.spec()}
+
+
+def _made(found: "Path | bytes | Future[Any]", kind: str) -> Response:
     """Return a file once it is made; the address of a picture changes with its content, so browsers may keep it."""
+    if isinstance(found, bytes):
+        return Response(found, media_type=kind, headers=KEPT)
     if isinstance(found, Path):
         return FileResponse(found, media_type=kind, headers=KEPT)
     if found.done():
@@ -177,7 +188,7 @@ def _growing(found: Path | None) -> Response:
     if found is None:
         return JSONResponse({"wait": True}, 202)
     content = read_regular(found, LARGEST_PICTURE)  # at once: the file is replaced by the next picture at any moment
-    return Response(content, media_type="image/jpeg", headers={"ETag": f'"{sha256(content).hexdigest()[:24]}"'})
+    return Response(content, media_type="image/jpeg")
 
 
 def _download(file: Path) -> Response:

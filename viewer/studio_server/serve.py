@@ -7,6 +7,7 @@ import contextlib
 import threading
 import webbrowser
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from anyio import to_thread
@@ -19,96 +20,73 @@ from starlette.types import ASGIApp
 from capture.errors import CaptureError, UserError
 from viewer.page.guard import COOKIE
 from viewer.studio.folder import CAPTURES, RUNS, StudioFolder, is_capture, is_run
-from viewer.studio.sockets import free_socket, http_server
 from viewer.studio.studio import Studio
-from viewer.studio_server.gate import Gate, OwnerSecret, file_routes, read_object, sentences, text_of, web_file
-from viewer.studio_server.phones import EVERYWHERE, Door, Phone, Phones
+from viewer.studio_server.gate import (
+    FILES,
+    Gate,
+    OwnerSecret,
+    file_routes,
+    free_socket,
+    http_server,
+    read_object,
+    sentences,
+    text_of,
+    web_file,
+)
+from viewer.studio_server.phones import EVERYWHERE, Door, Phones
 from viewer.studio_server.routes import owner_app
 from viewer.studio_server.uploads import Uploads
 
 COOKIE_NAME = f"{COOKIE}-phone"
-FILES = ("studio.css", "dom.js", "phone.js", "album.js", "live.js", "upload.js", "hemisphere.js", "voice.js")
-FILES += ("icon.svg",)
 FREE = {"/", "/live", "/join", *(f"/{name}" for name in FILES)}  # what a phone gets that is not in yet
 HOST = "127.0.0.1"
 
 
-class PhoneRoutes:
-    """Answers the requests of phones."""
+def phone_app(studio: Studio, phones: Phones) -> ASGIApp:
+    """Return the application of the phones' listeners."""
 
-    def __init__(self, studio: Studio):
-        """Answer for this studio."""
-        self._studio = studio
-        self._phones: Phones
+    def door() -> Door:
+        found = phones.door
+        if found is None:
+            raise CaptureError("Phones are not let in any more.")
+        return found
 
-    def app(self, phones: Phones) -> ASGIApp:
-        """Return the application of the phones' listeners."""
-        self._phones = phones
-        routes = [
-            *file_routes(FILES, "phone.html"),
-            Route("/live", self.live, methods=["GET"]),
-            Route("/join", self.join, methods=["POST"]),
-            Route("/api/state", self.state, methods=["GET"]),
-            Route("/api/role", self.role, methods=["POST"]),
-            Route("/api/leave", self.leave, methods=["POST"]),
-            *Uploads(self._studio.parts, self._target, lambda request: self._mine(request).id).routes(),
-        ]
-        return Gate(
-            Starlette(routes=routes, exception_handlers=sentences(self._studio.folder.root)), EVERYWHERE, self._admits
-        )
+    def admits(request: Request) -> Response | None:
+        if phones.door is None:
+            return PlainTextResponse("Phones are not let in at the moment.\n", 403)
+        request.state.phone = phones.find(request.cookies.get(COOKIE_NAME, ""))
+        if request.url.path in FREE or request.state.phone is not None:
+            return None
+        return JSONResponse({"error": "This phone is not in. Scan the new code that the studio shows."}, 401)
 
-    async def live(self, _request: Request) -> Response:
-        """The same page; its address tells it to show the live camera."""
+    async def live(_request: Request) -> Response:  # the same page; its address tells it to show the live camera
         return web_file("phone.html")
 
-    async def join(self, request: Request) -> Response:
-        """Let a phone in that shows the code."""
+    async def join(request: Request) -> Response:
         values = await read_object(request)
-        phone = self._phones.join(text_of(values, "token"), text_of(values, "name"))
+        phone = phones.join(text_of(values, "token"), text_of(values, "name"))
         answer = JSONResponse({"done": phone.name})
         answer.set_cookie(COOKIE_NAME, phone.secret, httponly=True, samesite="strict", path="/", max_age=86400)
         return answer
 
-    async def state(self, request: Request) -> Response:
-        """Say how the capture is doing that the phone sends to."""
-        phone, door = self._mine(request), self._door()
-        found = await to_thread.run_sync(self._studio.for_phone, door.capture)
-        return JSONResponse(found | {"name": phone.name, "role": phone.role, "shots": door.shots})
+    async def state(request: Request) -> Response:
+        phone, now = request.state.phone, door()
+        found = await to_thread.run_sync(studio.for_phone, now.capture)
+        return JSONResponse(found | {"name": phone.name, "role": phone.role, "shots": now.shots})
 
-    async def role(self, request: Request) -> Response:
-        """Note what a phone does in live mode."""
-        values = await read_object(request)
-        self._phones.set_role(self._mine(request), text_of(values, "role"))
+    async def role(request: Request) -> Response:
+        phones.set_role(request.state.phone, text_of(await read_object(request), "role"))
         return JSONResponse({"done": None})
 
-    async def leave(self, request: Request) -> Response:
-        """Forget a phone."""
-        self._phones.leave(self._mine(request).secret)
-        return JSONResponse({"done": None})
-
-    def _admits(self, request: Request) -> Response | None:
-        if self._phones.door is None:
-            return PlainTextResponse("Phones are not let in at the moment.\n", 403)
-        if request.url.path in FREE or self._phones.find(request.cookies.get(COOKIE_NAME, "")) is not None:
-            return None
-        return JSONResponse({"error": "This phone is not in. Scan the new code that the studio shows."}, 401)
-
-    def _mine(self, request: Request) -> Phone:
-        phone = self._phones.find(request.cookies.get(COOKIE_NAME, ""))
-        if phone is None:
-            raise CaptureError("This phone is not in any more. Scan the new code that the studio shows.")
-        return phone
-
-    def _door(self) -> Door:
-        door = self._phones.door
-        if door is None:
-            raise CaptureError("Phones are not let in any more.")
-        return door
-
-    def _target(self, request: Request, _key: str) -> str:
-        """Return the capture that phones send to, whichever they name."""
-        self._mine(request)
-        return self._door().capture
+    routes = [
+        *file_routes("phone.html"),
+        Route("/live", live, methods=["GET"]),
+        Route("/join", join, methods=["POST"]),
+        Route("/api/state", state, methods=["GET"]),
+        Route("/api/role", role, methods=["POST"]),
+        *Uploads(studio.parts, lambda *_: door().capture, lambda request: request.state.phone.id).routes(),
+    ]
+    return Gate(Starlette(routes=routes, exception_handlers=sentences(studio.folder.root)), EVERYWHERE, admits)
 
 
 def serve(
@@ -143,7 +121,7 @@ def serve(
     with contextlib.ExitStack() as ending:
         ending.callback(folder.release)
         studio = Studio(folder)
-        phones = Phones(folder.kept / "phones.json", folder.kept / "phones", PhoneRoutes(studio).app)
+        phones = Phones(folder.kept / "phones.json", folder.kept / "phones", partial(phone_app, studio))
         token, listener = folder.token(), ending.enter_context(free_socket(HOST, port))
         address = f"http://localhost:{listener.getsockname()[1]}/?token={token}"
         folder.note_address(address)

@@ -1,9 +1,8 @@
 // Begins: opens the canvas, loads the scene, draws the first picture, and joins hands, panel and renderer.
 import { byId, facts, loadMesh, loadPicture } from "./scene.js";
 import { openCanvas, sharp } from "./gpu.js";
-import { tilesBeyond } from "./tiles.js";
 import { openPasses, preparePasses } from "./passes.js";
-import { draw, pace_, samplesDone, startRenderer, tilesCame } from "./renderer.js";
+import { draw, pace_, samplesDone, startRenderer } from "./renderer.js";
 import { firstPlace, frameObject, lamp, onChange, setLamp, setShown, setView, shown, view } from "./state.js";
 import { drawBar, drawNotes, linesInSpace } from "./overlay.js";
 import { notesSay } from "./notes.js";
@@ -75,7 +74,6 @@ async function begin() {
   const [mesh, object, ground, normals] = await Promise.all([
     loadMesh(), loadPicture(addresses.object), loadPicture(addresses.ground), addresses.normals ? loadPicture(addresses.normals) : null,
   ]);
-  tilesBeyond(Math.max(object.width, object.height));
   preparePasses(mesh, { object, ground, normals });
   pickFrom(mesh);
   notesSay((text) => { byId("hint").textContent = text; });
@@ -90,7 +88,7 @@ async function begin() {
 
 // For whoever embeds the page: where camera and lamp are (radians and the scene's unit), and how to move them.
 window.shadowgraph = {
-  state: () => ({ view: { ...view }, lamp: { ...lamp }, shown: { ...shown }, samples: samplesDone(), finest: sharp ? sharp.samples : 0, tiles: tilesCame() }),
+  state: () => ({ view: { ...view }, lamp: { ...lamp }, shown: { ...shown }, samples: samplesDone(), finest: sharp ? sharp.samples : 0 }),
   set: (state) => { if (state.view) setView(state.view); if (state.lamp) setLamp(state.lamp); if (state.shown) setShown(state.shown); },
   pace: pace_,
 };

@@ -58,7 +58,7 @@ export function placeAt(x, y) {
 function sayShowing({ at, normal }) {
   const found = camerasThatShow(at, normal), [best] = found, name = ({ number }) => facts.cameras[number].view || "the camera";
   setShown({ showing: found.map(({ number }) => number) });
-  if (!best) { say(`None of ${facts.cameras.length} ${facts.cameras.length > 1 ? "views shows" : "view shows"} this place.`); return; }
+  if (!best) { say("No photo shows this place."); return; }
   const others = found.slice(1).map((one) => `${name(one)} (${Math.round(one.angle)}\u00b0)`);
   say(`Shown best by ${name(best)}, ${Math.round(best.angle)}\u00b0 from straight on${others.length ? `; also by ${others.join(", ")}` : ""}.`);
 }
@@ -101,16 +101,11 @@ function download(name, blob) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }
 
-// This page as one file with everything in it. A served page has its parts beside it, so there the server makes the file.
-export async function sharePage() {
-  if (served.saves === "socket") {
-    say("Making the page ...");
-    const answer = await fetch("share.html").catch(() => null);
-    say(answer?.ok ? "" : "The page could not be made: the server does not answer. Is it still running?");
-    if (answer?.ok) download(`${facts.name}.html`, await answer.blob());
-    return;
-  }
+// This page as it came, with the notes of now; a copy asks nobody for anything.
+export function sharePage() {
   const copy = original.cloneNode(true);
+  const policy = copy.querySelector("meta[http-equiv]");
+  policy.content = policy.content.replace("connect-src 'self'", "connect-src 'none'");
   copy.querySelector("#served").textContent = JSON.stringify({ saves: "", home: "" });
   copy.querySelector("#document").textContent = JSON.stringify(stage).replaceAll("<", "\\u003c");
   download(`${facts.name}.html`, new Blob([`<!doctype html>\n${copy.outerHTML}`], { type: "text/html" }));
@@ -127,8 +122,6 @@ export async function saveFile(kind) {
   const file = await answer.blob();
   download(`${facts.name}${file.type === "application/zip" ? ".zip" : suffix}`, file);
 }
-
-export const saveNotes = () => download("stage.json", new Blob([JSON.stringify(stage, null, 1)], { type: "application/json" }));
 
 export async function savePicture(redraw) {
   redraw();

@@ -3,7 +3,7 @@ import { byId, facts, served } from "./scene.js";
 import {
   canRedo, canUndo, editStage, lamp, lampFromAbove, lampTo, putLamp, redo, savedSentence, setLamp, setShown, setView, shown, stage, undo,
 } from "./state.js";
-import { recallView, removeNote, removeView, saveFile, saveNotes, savePicture, saveView, sharePage, startTool } from "./notes.js";
+import { recallView, removeNote, removeView, saveFile, savePicture, saveView, sharePage, startTool } from "./notes.js";
 import { showPhoto } from "./renderer.js";
 
 const RAKING = 8 * Math.PI / 180;
@@ -45,7 +45,6 @@ export function usePanel(redraw) {
   on("save-picture", "click", () => savePicture(redraw));
   on("share", "click", sharePage);
   on("list-keys", "click", listKeys);
-  on("save-notes", "click", saveNotes);
   for (const [kind, [title]] of Object.entries(served.formats || {})) byId("save-kind").append(new Option(title, kind));
   byId("save-row").hidden = !served.formats;
   on("save-file", "click", () => saveFile(byId("save-kind").value));
@@ -66,10 +65,9 @@ export const panelMoved = (act) => { whenMoved = act; };
 
 // What the colours of "What is known" mean, with their shares of the surface.
 function legend() {
-  const { known, kinds } = facts;
-  byId("legend").append(...Object.entries(kinds).map(([kind, words]) => {
-    const item = document.createElement("li"), sign = Object.assign(document.createElement("i"), { className: kind });
-    item.append(sign, words in known ? `${Math.round(100 * known[words])} % ${words}` : words);
+  byId("legend").append(...facts.legend.map(({ sign, words, share }) => {
+    const item = document.createElement("li");
+    item.append(Object.assign(document.createElement("i"), { className: sign }), share === null ? words : `${Math.round(100 * share)} % ${words}`);
     return item;
   }));
 }

@@ -1,9 +1,7 @@
 // The passes: surface (G-buffer), depth (shadow map), blur, light, show, lines. Each takes where it draws and from where.
 import { add, axesTowards, clipFrom, cross, norm, unit } from "./vectors.js";
-import { cameraOf, facts, groundPlace, toPage } from "./scene.js";
-import { coarser } from "./coarse.js";
+import { cameraOf, coarser, facts, groundPlace, toPage } from "./scene.js";
 import { bind, gl, pictureTexture, plainDepth, program, shareTexture, target } from "./gpu.js";
-import { tiles } from "./tiles.js";
 import { LOOKS, home, isBelow, shown, stage, view } from "./state.js";
 
 const SHADOW_SIDE = 1024, SHADOW_MOVING = 512;  // px of the shadow map
@@ -45,6 +43,7 @@ export function preparePasses(mesh, pictures) {
   pass.shadow = target(SHADOW_SIDE, SHADOW_SIDE, [], 2);
   pass.shadowMoving = target(SHADOW_MOVING, SHADOW_MOVING, [], 2);
   pass.object = pictureTexture(pictures.object, true);
+  pass.objectPx = Math.max(pictures.object.width, pictures.object.height);
   pass.ground = pictureTexture(pictures.ground, true);
   pass.groundSky = shareTexture(mesh.ground.sky, mesh.ground.side);
   pass.normals = pictures.normals ? pictureTexture(pictures.normals, false) : null;
@@ -142,7 +141,7 @@ function seenFromPhoto() {
 function surfaceShader(kind, isHome) {
   const isGround = kind === "GROUND";
   return shaderOf("surface.vert", "surface.frag", kind, facts.gloss && "GLOSS", ...(isGround ? [] : [
-    isCut() && "CUT", facts.addresses.normals && "NORMALS", tiles.has && "FINE", isHome && "HOME"]));
+    isCut() && "CUT", facts.addresses.normals && "NORMALS", pass.fine && "FINE", isHome && "HOME"]));
 }
 
 // Fewer pixels of the pictures are read while something moves.
@@ -173,7 +172,7 @@ export function drawSurface(into, seen, isMoving = false) {
   gl.uniform4f(at("objectWindow"), ...facts.objectWindow);
   const pictures = [["objectPicture", pass.object]];
   if (pass.normals) pictures.push(["normalPicture", pass.normals]);
-  if (tiles.has) pictures.push(["finePicture", tiles.picture], ["fineNormals", tiles.normals], ["fineThere", tiles.there]);
+  if (pass.fine) pictures.push(["finePicture", pass.fine], ["fineNormals", pass.fineNormals]);
   if (!isHome) {
     gl.uniformMatrix4fv(at("seenClip"), false, seenClip.clip);
     gl.uniform1f(at("lift"), seenClip.lift);

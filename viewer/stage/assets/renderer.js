@@ -2,7 +2,6 @@
 import { GOLDEN, add, clamp, halton, norm } from "./vectors.js";
 import { byId, facts, loadPicture, toPage } from "./scene.js";
 import { drop, gl, pictureTexture, sharp, target } from "./gpu.js";
-import { tiles, wantTiles } from "./tiles.js";
 import { cameraNow, lamp, lampPlace, shown, stage, view } from "./state.js";
 import { drawBlur, drawDepth, drawLight, drawLines, drawShow, drawSurface, gBufferFormats, lampPoint, pass, viewClip } from "./passes.js";
 
@@ -12,10 +11,11 @@ const COARSEST = 5, COARSE_AT_FIRST = 3;  // px of the screen per px of the pict
 const QUIET_MS = 250;               // after the last movement comes rest
 const LEAST_PART = 0.25;            // of the lamp's radius: 32 of these cover its disc twice, so that none is seen alone
 const BLUR = 0.035;                 // radii of the object: unsharp masking and curvature look at forms of this size
+const SHARPER = 1.1;                // times the pixels of the first picture: below, the photo's own would show nothing new
 const canvas = byId("picture");
 const sized = { moving: {}, rest: {} };
 let coarse = COARSE_AT_FIRST, atRest = 1, pace = 0, restsAt = 0, scheduled = false, count = 0, movedAt = 0, screen_ = [0, 0], painter = () => [], firstDrawn = () => {};
-let surfaceOf = "", shadowOf = "", light = null, seen = null, sizes = 0;
+let isSharpened = false, surfaceOf = "", shadowOf = "", light = null, seen = null, sizes = 0;
 export const pace_ = { frames: [], pointer: [], firstPaint: 0 };
 export const samplesDone = () => count;
 
@@ -23,9 +23,9 @@ export function startRenderer(lines, drawn) { painter = lines; firstDrawn = draw
 
 export function draw(what, since = 0) {
   count = 0;
-  if (what === "view" || what === "stage" || what === "tiles") surfaceOf = "";
+  if (what === "view" || what === "stage" || what === "fine") surfaceOf = "";
   if (what === "lamp" || what === "stage") shadowOf = "";
-  if (what !== "tiles" && what !== "size" && what !== "still") restsAt = performance.now() + QUIET_MS;
+  if (what !== "fine" && what !== "size" && what !== "still") restsAt = performance.now() + QUIET_MS;
   if (since && !movedAt) movedAt = since;
   schedule();
 }
@@ -129,31 +129,20 @@ function resting(have, full) {
   [have.mean, have.spare] = [have.spare, have.mean];
   count++;
   drawShow(have.spare.textures[0], have.width / full[0], have.height / full[1], full);
-  if (count === 1) askForTiles(full);
+  if (count === 1) sharpen(full);
 }
 
 const withoutJitter = (full) => { const camera = cameraNow(); return { ...viewClip(camera, ...full, [0, 0]), camera }; };
 
-// Which part of the object's window the screen shows, and how large: tiles are asked for accordingly.
-function askForTiles(full) {
-  if (!facts.addresses.tiles) return;
-  const camera = cameraNow(), away = norm(camera.eye), side = Math.min(...full), photo = norm(toPage(facts.cameras[0].eye));
-  const [, , w, h] = facts.objectWindow, perShare = view.focal * side * photo / away / facts.cameras[0].focal[0];
-  const corners = [[0, 0], [full[0], 0], [0, full[1]], full].map(([x, y]) => sharesAt(x, y, full, camera));
-  const part = corners.some((c) => !c) ? [0, 0, 1, 1] : [0, 1].map((k) => Math.min(...corners.map((c) => c[k]))).concat([0, 1].map((k) => Math.max(...corners.map((c) => c[k]))));
-  wantTiles(part, perShare * Math.max(w, h), () => draw("tiles"));
-}
-
-// Shares of the object's window that a pixel shows, taken on a plane through the object's middle.
-function sharesAt(x, y, full, camera) {
-  const side = Math.min(...full), f = view.focal * side, away = norm(camera.eye);
-  const q = [(x - full[0] / 2 - view.shift[0] * side) / f, (y - full[1] / 2 - view.shift[1] * side) / f];
-  const p = add(add(add(camera.eye, camera.forward, away), camera.right, q[0] * away), camera.down, q[1] * away);
-  const eye = toPage(facts.cameras[0].eye), d = add(p, eye, -1), [right, down, forward] = facts.cameras[0].axes;
-  const at = (axis) => axis[0] * d[0] + axis[1] * d[1] + axis[2] * d[2], z = at(forward);
-  if (z <= 0) return null;
-  const u = facts.cameras[0].middle[0] + facts.cameras[0].focal[0] * at(right) / z, v = facts.cameras[0].middle[1] + facts.cameras[0].focal[1] * at(down) / z;
-  return [(u - facts.objectWindow[0]) / facts.objectWindow[2], (v - facts.objectWindow[1]) / facts.objectWindow[3]];
+// Loads the photo's own pixels once the screen shows the object larger than the first picture of it is.
+async function sharpen(full) {
+  const { fine, fineNormals } = facts.addresses, [, , w, h] = facts.objectWindow, camera = facts.cameras[0];
+  const px = view.focal * Math.min(...full) * norm(toPage(camera.eye)) / norm(cameraNow().eye) / camera.focal[0] * Math.max(w, h);
+  if (!fine || isSharpened || px < SHARPER * pass.objectPx) return;
+  isSharpened = true;
+  const [picture, normals] = await Promise.all([loadPicture(fine), loadPicture(fineNormals)]);
+  [pass.fine, pass.fineNormals] = [pictureTexture(picture, true), pictureTexture(normals, false)];
+  draw("fine");
 }
 
 export async function showPhoto(name) {
@@ -161,5 +150,3 @@ export async function showPhoto(name) {
   pass.photo = name && facts.addresses.photos[name] ? pictureTexture(await loadPicture(facts.addresses.photos[name]), true) : null;
   draw("shown");
 }
-
-export const tilesCame = () => tiles.came;

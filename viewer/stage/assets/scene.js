@@ -1,4 +1,4 @@
-// The scene: decodes what viewer/stage/pack.py packed. Lengths of the page are radii of the object from its middle.
+// The scene: decodes what viewer/stage/parts.py packed. Lengths of the page are radii of the object from its middle.
 import { add, dot, scaled } from "./vectors.js";
 
 export const byId = (id) => document.getElementById(id);
@@ -26,12 +26,8 @@ const ROOTS = Uint8Array.from({ length: 256 }, (_, i) => {
   return Math.round(255 * Math.sqrt(c > 0.04045 ? ((c + 0.055) / 1.055) ** 2.4 : c / 12.92));
 });
 
-async function bytesOf(address) {
-  if (!address.startsWith("data:")) {
-    const answer = await fetch(address);
-    if (!answer.ok) throw new Error(`${address} was not found`);
-    return new Uint8Array(await answer.arrayBuffer());
-  }
+// The bytes of a data address: the page has all its parts in it.
+function bytesOf(address) {
   const text = atob(address.slice(address.indexOf(",") + 1)), out = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) out[i] = text.charCodeAt(i);
   return out;
@@ -39,7 +35,7 @@ async function bytesOf(address) {
 
 async function unpacked(address) {
   if (typeof DecompressionStream === "undefined") throw new Error("this browser is too old to unpack the scene");
-  const stream = new Blob([await bytesOf(address)]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const stream = new Blob([bytesOf(address)]).stream().pipeThrough(new DecompressionStream("gzip"));
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
@@ -78,6 +74,43 @@ export async function loadMesh() {
 
 // A picture as the graphics card takes it: decoded beside the page's own thread, its numbers as they are in the file.
 export async function loadPicture(address) {
-  const file = new Blob([await bytesOf(address)], { type: "image/jpeg" });
+  const file = new Blob([bytesOf(address)], { type: "image/jpeg" });
   return createImageBitmap(file, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
+}
+
+// Coarser triangles for pictures in motion: vertices that share a cell become one [Rossignac and Borrel 1993].
+// The mesh left when the object's box has `cells` cells along its longest side; only the vertices that it needs.
+export function coarser(mesh, cells) {
+  const { place, index, count } = mesh, low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+  for (let i = 0, at = 0; i < count; i++) for (let k = 0; k < 3; k++, at++) {
+    if (place[at] < low[k]) low[k] = place[at];
+    if (place[at] > high[k]) high[k] = place[at];
+  }
+  const step = Math.max(high[0] - low[0], high[1] - low[1], high[2] - low[2]) / cells, n = low.map((from, k) => Math.floor((high[k] - from) / step) + 1);
+  const owner = new Int32Array(n[0] * n[1] * n[2]).fill(-1), cell = new Int32Array(count), kept = new Int32Array(count), out = new Uint32Array(index.length);
+  const per = 1 / step, across = n[0], level = n[0] * n[1];
+  let vertices = 0;
+  for (let i = 0, at = 0; i < count; i++, at += 3) {
+    const c = ((place[at] - low[0]) * per | 0) + across * ((place[at + 1] - low[1]) * per | 0) + level * ((place[at + 2] - low[2]) * per | 0);
+    if (owner[c] < 0) { owner[c] = vertices; kept[vertices++] = i; }
+    cell[i] = owner[c];
+  }
+  let corners = 0;
+  for (let i = 0; i < index.length; i += 3) {
+    const a = cell[index[i]], b = cell[index[i + 1]], c = cell[index[i + 2]];
+    if (a === b || b === c || c === a) continue;
+    out[corners] = a; out[corners + 1] = b; out[corners + 2] = c;
+    corners += 3;
+  }
+  return { ...taken(mesh, kept, vertices), index: out.slice(0, corners), count: vertices };
+}
+
+// The numbers of these vertices alone, in one block.
+function taken(mesh, kept, vertices) {
+  const made = {};
+  for (const [name, size] of [["place", 3], ["facing", 4], ["paint", 4], ["shine", 4], ["bounced", 4], ["soft", 4]]) {
+    const from = mesh[name], to = made[name] = new from.constructor(size * vertices);
+    for (let i = 0, at = 0; i < vertices; i++) for (let k = 0, start = size * kept[i]; k < size; k++) to[at++] = from[start + k];
+  }
+  return made;
 }

@@ -8,7 +8,7 @@ precision highp sampler2DShadow;
 uniform vec3 groundMean;
 uniform sampler2D objectPicture, normalPicture, groundPicture;
 uniform vec4 objectWindow;           // left, top, width, height in shares of the photo
-uniform sampler2D finePicture, fineNormals, fineThere;  // of the photo's own pixels, and which tiles have come
+uniform sampler2D finePicture, fineNormals;  // of the photo's own pixels
 uniform sampler2DShadow seenMap;     // depth as the photo's camera sees it
 uniform mat4 seenClip;
 uniform float lift;                  // along the normal, before a place is looked up in seenMap
@@ -76,9 +76,8 @@ void main() {
     fine = 2.0 * texture(normalPicture, inWindow).rgb - 1.0;
 #endif
 #ifdef FINE
-    float has = texture(fineThere, inWindow).r;
-    shown = mix(shown, texture(finePicture, inWindow).rgb, has);
-    fine = mix(fine, 2.0 * texture(fineNormals, inWindow).rgb - 1.0, has);
+    shown = texture(finePicture, inWindow).rgb;
+    fine = 2.0 * texture(fineNormals, inWindow).rgb - 1.0;
 #endif
     colour = mix(colour, shown, share);
     n = normalize(mix(n, fine, share));

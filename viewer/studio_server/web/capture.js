@@ -1,9 +1,8 @@
 // One capture: its board, its photos as they arrive, the verdict, and the start of a run.
 
-import { PRESETS, about, ask as question, attempt, bytes, change, day, dialog, duration, failure, h, key, picture, plural, presetWords, rename, size, toast } from "./dom.js";
+import { PRESETS, about, ask as question, attempt, bytes, change, day, dialog, duration, failure, h, key, picture, plural, presetWords, rename, toast } from "./dom.js";
 import { boardOnScreen, printLink } from "./board.js";
 import { dome } from "./hemisphere.js";
-import { phones } from "./phones.js";
 import { Sender, chooser, complaint, dropped, sending, unused } from "./upload.js";
 import { voice } from "./voice.js";
 
@@ -165,9 +164,40 @@ export function capture(name, again) {
     if (!row.runs.length) return null;
     return h("section", { class: "panel" }, h("h2", {}, "Runs"), h("ul", { class: "plain" }, row.runs.map((run) => h("li", { key: run.key },
       h("a", { href: `#/run/${key(run.key)}` }, run.title === row.title ? presetWords(run.preset) : run.title), ` ${run.state}`, run.state === "running" && `, ${Math.round(100 * run.progress.share)} %`,
-      run.size && `, ${size(run)}`, h("span", { class: "quiet small" }, ` ${run.state === "finished" ? duration(run.progress.elapsed_s) : day(run.date)}`),
+      run.size && `, ${run.size}`, h("span", { class: "quiet small" }, ` ${run.state === "finished" ? duration(run.progress.elapsed_s) : day(run.date)}`),
       run.state === "failed" && h("div", { class: "bad small" }, run.sentence)))));
   }
 
   return view;
+}
+
+const DOES = { camera: " photographs", light: " holds the light" };
+
+/** Phones that are let in: the switch, the code to scan, who is there. */
+function phones(capture, again) {
+  let row = { on: false, phones: [] }, isLive = false;
+  const turn = (name, values) => attempt(async () => { await change(name, values); await refresh(); again(); });
+  const refresh = async () => { row = await question("/api/phones"); };
+
+  return {
+    refresh,
+    button: () => h("button", { "aria-pressed": String(row.on && row.capture === capture), onclick: () => (row.on && row.capture === capture ? turn("send_away", {}) : turn("let_in", { key: capture })) },
+      row.on && row.capture === capture ? "Disconnect phones" : "Let phones in"),
+    panel: () => {
+      if (!row.on || row.capture !== capture) return null;
+      const address = isLive ? row.live_address : row.address;
+      return h("div", { class: "panel", key: "phones" }, h("h3", {}, "Scan this with the phone's camera"),
+        h("div", { class: "bar" },
+          h("img", { class: "qr", src: `/api/code?${isLive ? "live&" : ""}v=${key(address)}`, alt: "Code with the address for the phone" }),
+          h("div", { class: "grow" },
+            h("p", {}, "The phone must be on the same network. Each code lets one phone in; the next one shows at once. Photos travel unencrypted on your network."),
+            h("p", { class: "small" }, "Or open ", h("code", {}, address)),
+            h("label", {}, h("input", { type: "checkbox", checked: isLive, onchange: (event) => { isLive = event.target.checked; again(); } }),
+              " Live camera (https). The phone warns, because this machine signs for itself: choose Advanced, then Proceed."),
+            row.phones.length === 0 && h("p", {}, "No phone yet."),
+            row.phones.length > 0 && h("ul", { class: "plain" }, row.phones.map((one, k) => h("li", {}, `Phone ${k + 1} (${one.name})${DOES[one.role] || ""}${one.is_here ? "" : ", not connected: it goes on sending when it is back"}`))),
+            row.phones.some((one) => one.role === "camera") && h("button", { class: "main", onclick: () => turn("shoot", {}) }, "Take a photo"),
+            h("p", { class: "small quiet" }, `Closes by itself in ${duration(row.left_s)}.`))));
+    },
+  };
 }

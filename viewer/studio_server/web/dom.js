@@ -1,14 +1,13 @@
 // Elements, requests and words that all pages share. Text only ever becomes text nodes: nothing that a stranger wrote is markup.
 
-const SVG = new Set(["svg", "circle", "path", "ellipse", "line", "text", "rect", "g", "title"]);
+const SVG = new Set(["svg", "circle", "path", "text"]);
 
 /** An element; attributes that begin with "on" are handlers, false and null leave an attribute or child out. */
 export function h(tag, attributes = {}, ...children) {
-  const element = SVG.has(tag) && !(tag === "title" && !attributes.svg)
-    ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
+  const element = SVG.has(tag) ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
   element.on = {};
   for (const [name, value] of Object.entries(attributes || {})) {
-    if (value === false || value === null || value === undefined || name === "svg") continue;
+    if (value === false || value === null || value === undefined) continue;
     if (name.startsWith("on")) { element[name] = value; element.on[name] = value; }
     else if (name === "key") element.key = value;
     else if (name === "value" || name === "checked") element[name] = value;
@@ -94,51 +93,30 @@ export function toast(words, isBad = false) {
   setTimeout(() => element.remove(), isBad ? 12000 : 5000);
 }
 
-const pictures = new Map(); // address -> address of what was loaded
-const waiting = new Map(); // address -> the images that wait for it
-
 const NOTHING = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="; // without an address a browser draws a broken picture
+const PAUSE_MS = 600, LONGER_MS = 50, TRIES = 100; // until it is asked for anew, longer each time; some minutes in all
 
 /** A picture that may still have to be made; its place stays empty until then. */
-export function picture(address, words, className = "picture") {
-  const known = pictures.get(address);
-  const image = h("img", { class: className, alt: words, key: address, src: known || NOTHING });
+export function picture(address, words) {
+  let tries = 0;
+  const load = () => { if (image.isConnected || !tries) image.src = address; };
+  const image = h("img", { loading: "lazy", class: "picture", alt: words, key: address, onerror: () => {
+    image.src = NOTHING;
+    if (++tries < TRIES) setTimeout(load, PAUSE_MS + LONGER_MS * tries);
+  } });
   image.stays = true;
-  if (!known) {
-    const others = waiting.get(address);
-    if (others) others.add(image);
-    else {
-      waiting.set(address, new Set([image]));
-      load(address, 0);
-    }
-  }
+  load();
   return image;
 }
 
-async function load(address, tries) {
-  const images = [...waiting.get(address)];
-  if (tries > 3 && !images.some((image) => image.isConnected)) { waiting.delete(address); return; }
-  try {
-    const response = await fetch(address, { credentials: "same-origin" });
-    if (response.status === 200) {
-      pictures.set(address, URL.createObjectURL(await response.blob()));
-      for (const image of waiting.get(address)) image.src = pictures.get(address);
-      waiting.delete(address);
-      return;
-    }
-    if (response.status !== 202) { waiting.delete(address); return; }
-  } catch { /* the studio is away: later */ }
-  setTimeout(() => load(address, tries + 1), tries < 20 ? 600 : 2000);
-}
-
 /** Ask in a dialog; resolves to the text, to true where none is asked for, or to null. */
-export function dialog(title, words, action, { text = null, isDanger = false, body = null } = {}) {
+export function dialog(title, words, action, { text = null, isDanger = false } = {}) {
   return new Promise((resolve) => {
     const field = text === null ? null : h("input", { type: "text", value: text, "aria-label": title, maxlength: "120" });
     const done = (value) => { box.close(); box.remove(); resolve(value); };
     const submit = () => done(field ? field.value : true);
     const box = h("dialog", { "aria-label": title, oncancel: () => done(null) },
-      h("h2", {}, title), words && h("p", {}, words), body, field,
+      h("h2", {}, title), words && h("p", {}, words), field,
       h("div", { class: "bar" }, h("button", { onclick: () => done(null) }, "Cancel"),
         h("button", { class: isDanger ? "danger" : "main", onclick: submit }, action)));
     if (field) field.onkeydown = (event) => {
@@ -184,12 +162,6 @@ export function about(seconds) {
 export function day(seconds) {
   const when = new Date(seconds * 1000);
   return when.toLocaleString(undefined, { dateStyle: "medium", timeStyle: "short" });
-}
-
-export function size(row) {
-  if (!row.size) return "";
-  const unit = row.unit === "mm" ? "mm" : "units";
-  return `${row.size.map((value) => (row.unit === "mm" ? value.toFixed(0) : value.toPrecision(3))).join(" × ")} ${unit}`;
 }
 
 /** How fine a run is: what the pages call the presets, and what each is for. */

@@ -1,8 +1,7 @@
 // All captures and runs of the folder.
 
-import { attempt, bytes, change, day, dialog, duration, h, key, picture, plural, presetWords, rename, size, toast } from "./dom.js";
-import { queue } from "./queue.js";
-import { frame } from "./result.js";
+import { attempt, bytes, change, day, dialog, duration, h, key, picture, plural, presetWords, rename, toast } from "./dom.js";
+import { frame, queue } from "./result.js";
 
 const WORDS = {
   arriving: "Photos are arriving", checking: "Being checked", checked: "Checked", new: "New", waiting: "In the queue",
@@ -48,15 +47,15 @@ export function home(_, again) {
 
   function empty(ask) {
     return h("section", { class: "panel pair welcome" }, h("div", { class: "shown" }, frame("/example/", "An example, to relight and turn"),
-      h("p", { class: "small quiet" }, "Made of 36 photos. Move over it: the light follows. Drag to turn it.")),
-    h("div", {}, h("h2", {}, "From photos to a thing on the screen"),
+      h("p", { class: "small quiet" }, "Made from 36 photos. Move over it: the light follows. Drag to turn it.")),
+    h("div", {}, h("h2", {}, "From photos to a 3D model"),
       h("p", {}, "Shadowgraph makes a solid, measured model of an object from photos of it and its shadows. It takes a camera or phone on a tripod, a flashlight, and a room that can be made dark."),
       h("div", { class: "bar" }, h("button", { class: "main", onclick: fresh }, "New capture"),
         h("button", { onclick: tryExample }, "Try the example"),
         h("button", { onclick: () => choose(ask, again) }, "Add a folder")),
-      h("p", { class: "small quiet" }, "The example does the same with photos that are here already, in a minute or two."),
+      h("p", { class: "small quiet" }, "The example uses photos that come with the program, and takes a minute or two."),
       h("ol", { class: "plain steps" },
-        h("li", {}, h("b", {}, "Board. "), "Print a page with squares, or take a blank sheet of paper: it tells how large things are. Photograph it on the table in room light."),
+        h("li", {}, h("b", {}, "Board. "), "Print a page with squares, or take a blank sheet of paper: it gives the scale. Photograph it on the table in room light."),
         h("li", {}, h("b", {}, "Photos. "), "Put the object on the table, make the room dark, and take 15 to 40 photos; hold the flashlight in another place for each."),
         h("li", {}, h("b", {}, "Model. "), "Bring the photos here. You are told whether they are good, and what to photograph next; then start."))));
   }
@@ -77,7 +76,7 @@ export function home(_, again) {
         h("p", {}, h("span", { class: `tag ${state === "failed" ? "bad" : ""}` }, WORDS[state] || state), " ",
           card.verdict && h("span", { class: `tag ${card.verdict}` }, card.verdict)),
         words(card, run, state),
-        h("p", { class: "small quiet" }, [card.count ? plural(card.count, "photo") : null, shown && size(shown),
+        h("p", { class: "small quiet" }, [card.count ? plural(card.count, "photo") : null, shown && shown.size,
           (shown || run) && presetWords((shown || run).preset), day(card.date)].filter(Boolean).join(" · "))),
       h("div", { class: "foot" },
         shown && h("a", { class: "button small", href: `#/run/${key(shown.key)}` }, "Open"),

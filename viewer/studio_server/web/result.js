@@ -1,13 +1,39 @@
-// A run: its progress while it runs, its result once it is finished; two results side by side.
+// Runs: those that wait for this machine, the progress of one, its result once it is finished, two results side by side.
 
-import { about, ask, attempt, change, dialog, duration, failure, h, key, plural, presetWords, rename, size } from "./dom.js";
-import { leftOf } from "./queue.js";
+import { about, ask, attempt, bytes, change, dialog, duration, failure, h, key, plural, presetWords, rename } from "./dom.js";
 import { saving } from "./save.js";
+
+/** The seconds that jobs take together; null where that is not known. */
+const leftOf = (jobs) => (jobs.some((job) => job.left_s === null || job.left_s === undefined) ? null : jobs.reduce((sum, job) => sum + job.left_s, 0));
+
+/** `jobs`: in the order in which they run; `again` draws the page anew. */
+export function queue(jobs, again) {
+  if (!jobs.length) return null;
+  const left = leftOf(jobs), told = left === null ? "how long they take is not known yet" : `all done in ${about(left)}`;
+  const act = (job, action) => attempt(async () => { await change("queue", { job: job.id, action }); again(); });
+  return h("section", { class: "panel queue", key: "queue" }, h("h2", {}, "At work"),
+    h("p", { class: "quiet" }, `One run at a time, ${jobs.length} in the queue; ${told}.`),
+    h("ol", { class: "plain" }, jobs.map((job, place) => h("li", { key: job.id },
+      h("a", { href: `#/run/${key(job.run)}` }, `${job.title}, ${presetWords(job.preset).toLowerCase()}`), ` ${cost(job)} `,
+      job.state === "waiting" && place > 1 && h("button", { "aria-label": `Next in line: ${job.title}`, onclick: () => act(job, "first") }, "Next in line"), " ",
+      stop(job)))));
+
+  function stop(job) {
+    const words = job.state === "running" ? "Stop and keep" : "Remove";
+    return h("button", { "aria-label": `${words}: ${job.title}`, onclick: () => act(job, "stop") }, words);
+  }
+}
+
+function cost(job) {
+  const memory = job.bytes ? `, ${bytes(job.bytes)} of memory` : "";
+  if (job.state === "running") return job.left_s === null || job.left_s === undefined ? "has just begun" : `${duration(job.left_s)} left${memory}`;
+  return job.left_s ? `waits, ${about(job.left_s)}${memory}` : "waits";
+}
 
 export function run(name, again) {
   const view = { pause: 1000, wide: true };
   let clock = 0, measured = 0;
-  const saver = saving(name, again), watched = watch(name);
+  const saver = saving(name, again), watched = growing(name);
 
   view.render = async (ask) => {
     const state = await ask("/api/state");
@@ -47,11 +73,11 @@ export function run(name, again) {
       one.sentence && (one.state === "failed" ? failure(one.sentence) : h("p", {}, one.sentence, one.state === "waiting" && begins)),
       one.state === "running" && h("p", { class: "quiet" }, "It goes on when this page or the studio is closed."),
       h("div", { class: "bar" },
-        (one.state === "running" || one.state === "waiting") && one.job && h("button", { onclick: () => queue(one, "stop") }, one.state === "running" ? "Stop and keep" : "Take out of the queue"),
+        (one.state === "running" || one.state === "waiting") && one.job && h("button", { onclick: () => act(one, "stop") }, one.state === "running" ? "Stop and keep" : "Remove from the queue"),
         one.state === "running" && h("button", { onclick: () => inspect(one) }, "Watch it grow in 3D"),
-        one.state === "waiting" && h("button", { onclick: () => queue(one, "first") }, "Next in line"),
+        one.state === "waiting" && h("button", { onclick: () => act(one, "first") }, "Next in line"),
         one.state === "failed" && photos && h("a", { class: "button main", href: photos }, "Look at its photos"),
-        (one.state === "failed" || one.state === "stopped") && one.job && h("button", { class: one.state === "stopped" ? "main" : "", onclick: () => queue(one, "again") }, "Go on where it stood")));
+        (one.state === "failed" || one.state === "stopped") && one.job && h("button", { class: one.state === "stopped" ? "main" : "", onclick: () => act(one, "again") }, "Go on where it stood")));
   }
 
   function result(one) {
@@ -59,9 +85,7 @@ export function run(name, again) {
       one.has_mesh ? stage(one) : h("p", { class: "bad" }, "This run has no result that could be shown: its mesh is missing. Start it again."),
       h("div", { class: "bar" }, one.has_mesh && saver.share(), one.has_mesh && h("button", { onclick: fill }, "Fill the window"),
         one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report")),
-      h("ul", { class: "facts" }, [size(one), one.preset && presetWords(one.preset), `made in ${duration(one.progress.elapsed_s)}`,
-        one.guessed !== null && one.guessed !== undefined && `${Math.round(100 * one.guessed)} % of the surface is a guess: no photo shows it`]
-        .filter(Boolean).map((text) => h("li", {}, text))),
+      facts(one),
       one.scale && h("p", { class: "quiet" }, one.scale),
       one.verdict_sentence && h("p", {}, one.verdict_sentence),
       one.warnings.length > 0 && h("details", { class: "panel" }, h("summary", { class: "warn" }, plural(one.warnings.length, "remark")),
@@ -70,7 +94,7 @@ export function run(name, again) {
   }
 
   const fill = () => attempt(() => document.querySelector("iframe.result").requestFullscreen());
-  const queue = (one, action) => attempt(async () => { await change("queue", { job: one.job, action }); again(); });
+  const act = (one, action) => attempt(async () => { await change("queue", { job: one.job, action }); again(); });
   const remove = (one) => attempt(async () => {
     if (await dialog(`Delete ${one.title}?`, "It goes into the trash, from where it can be put back.", "Delete", { isDanger: true })) {
       await change("delete", { key: one.key });
@@ -91,37 +115,19 @@ export function run(name, again) {
   return view;
 }
 
-/** A picture of a run under way, as it grows: the one before stays until the next is there. */
-function watch(name) {
-  let image = null, shown = "", isAsked = false;
-
-  async function load() {
-    isAsked = true;
-    try {
-      const response = await fetch(`/api/growing?key=${key(name)}`, { credentials: "same-origin" });
-      if (response.status === 200) {
-        const made = response.headers.get("ETag");
-        if (made !== shown) {
-          const before = image.src;
-          image.src = URL.createObjectURL(await response.blob());
-          if (before.startsWith("blob:")) URL.revokeObjectURL(before);
-          image.hidden = false;
-          shown = made;
-        }
-      }
-    } catch { /* the studio is away: later */ }
-    isAsked = false;
-  }
-
+/** A picture of a run under way, asked for anew each time: the one before stays until the next is there. */
+function growing(name) {
+  const image = h("img", { class: "growing", key: "growing", hidden: true, alt: "What the run has so far: its photos, then the surface as it grows",
+    onload: () => { image.hidden = false; }, onerror: () => { image.hidden = true; } });
+  image.stays = true;
   return (one) => {
-    if (!image) {
-      image = h("img", { class: "growing", key: "growing", hidden: true, alt: "What the run has so far: its photos, then the surface as it grows" });
-      image.stays = true;
-    }
-    if (one.growing && !isAsked) load();
+    if (one.growing) image.src = `/api/growing?key=${key(name)}&v=${Date.now()}`;
     return image;
   };
 }
+
+const facts = (one) => h("ul", { class: "facts" }, [one.size, one.preset && presetWords(one.preset), `made in ${duration(one.progress.elapsed_s)}`,
+  one.guessed !== null && `${Math.round(100 * one.guessed)} % of the surface is a guess: no photo shows it`].filter(Boolean).map((text) => h("li", {}, text)));
 
 const stageOf = (one) => `/stage/${one.key.split("/").map(key).join("/")}/`;
 
@@ -175,13 +181,12 @@ export function compare(names) {
     const state = await ask("/api/state");
     const runs = state.cards.flatMap((card) => card.runs);
     const two = names.split("|").map(decodeURIComponent).map((name) => runs.find((one) => one.key === name));
-    if (two.length !== 2 || two.some((one) => !one || one.state !== "finished")) throw new Error("Two finished runs are needed to compare; one of these is none.");
+    if (two.length !== 2 || two.some((one) => !one || one.state !== "finished")) throw new Error("Two finished runs are needed to compare; one of these is not finished, or not here any more.");
     document.title = `${two[0].title} and ${two[1].title} · Shadowgraph studio`;
     return [
       h("div", { class: "bar" }, h("h1", { class: "grow" }, `${two[0].title} and ${two[1].title}`), h("a", { class: "button", href: "#/" }, "All captures")),
       h("div", { class: "pair" }, two.map((one) => h("div", { key: one.key }, h("h2", {}, one.title), stage(one),
-        h("ul", { class: "facts" }, [size(one), presetWords(one.preset), `made in ${duration(one.progress.elapsed_s)}`,
-          one.guessed !== null && `${Math.round(100 * (one.guessed || 0))} % guessed`].filter(Boolean).map((text) => h("li", {}, text)))))),
+        facts(one)))),
     ];
   };
   return view;

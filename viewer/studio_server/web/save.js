@@ -58,7 +58,6 @@ export function saving(name, again) {
 
   const addressOf = (one) => `/download?key=${key(name)}&format=${key(one.name)}&size=${key(one.size)}`;
   const make = (one) => attempt(async () => {
-    if (one.error) await change("forget_save", wish(one));
     try { await change("save", wish(one)); } finally { refresh(); }
     return true;
   });
