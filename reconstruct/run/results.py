@@ -121,7 +121,7 @@ def save_results(mesh: trimesh.Trimesh, fields: SolvedScene, calibrated: Calibra
         mesh: of extract_mesh(fields).
 
     Raises:
-        ReconstructionError: the mesh is empty, or a file does not read back.
+        ReconstructionError: the mesh is empty.
         OSError: no room, or no right to write there.
     """
     folder.mkdir(parents=True, exist_ok=True)

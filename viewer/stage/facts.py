@@ -168,7 +168,7 @@ def known_shares(run: StoredRun) -> dict[str, float]:
 def size_sentence(run: StoredRun) -> str:
     """Return the object's size in words."""
     x, y, z = (float(e) for e in run.mesh.extents)
-    return Contents(extents=(x, y, z)).sentence(run.unit)
+    return Contents(extents=(x, y, z), unit=run.unit).sentence()
 
 
 def home_view(fields: SolvedScene, studio: Studio) -> dict[str, float]:

@@ -58,19 +58,6 @@ def packed(scene: StageScene, centre: Float[np.ndarray, "3"], radius: float) -> 
     return Block(gzip.compress(b"".join(content), PACKING, mtime=0), parts)
 
 
-def unpacked_corners(block: bytes, parts: dict[str, dict[str, Any]]) -> Shaped[np.ndarray, " n"]:
-    """Return the faces' corners of a packed block, to check what was written.
-
-    Raises:
-        ValueError, LookupError: it holds something else.
-    """
-    raw = np.frombuffer(gzip.decompress(block), np.uint8)
-    start, count = parts["corners"]["offset"], parts["corners"]["count"]
-    planes = raw[start : start + 4 * count].reshape(4, count).astype(np.int64)
-    zigzag = planes[0] << 24 | planes[1] << 16 | planes[2] << 8 | planes[3]
-    return np.cumsum(np.where(zigzag & 1, -(zigzag + 1) // 2, zigzag // 2))
-
-
 def _share(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
     return np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)
 

@@ -1,6 +1,5 @@
 """The stage as a page: in one file with all its parts, or as a page that asks for its parts beside it."""
 
-import base64
 import html
 import json
 import re
@@ -10,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from capture.errors import ReconstructionError
 from capture.files.title import title_of
 from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, OnProgress
 from reconstruct.export.formats import FORMATS
@@ -18,7 +16,6 @@ from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
 from reconstruct.stored_run.stage_pack import StagePack, addressed
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.display.embedded import as_address, hash_of
-from viewer.stage.pack import unpacked_corners
 from viewer.stage.pack_file import kind_of, stage_pack
 
 SCRIPTS = (
@@ -39,21 +36,16 @@ SCRIPTS = (
 )
 SHADERS = ("surface.vert", "surface.frag", "depth.frag", "full.vert", "light.frag", "blur.frag", "show.frag")
 SHADERS += ("lines.vert", "lines.frag")
-READ_ERRORS = (OSError, ValueError, LookupError, TypeError, EOFError)
 IMPORTED, EXPORTED = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL), re.compile(r"^export ", re.MULTILINE)
-SCENE = re.compile(r'<script type="application/json" id="scene">(.*?)</script>', re.DOTALL)
 
 
-def stage_page(run_dir: Path, on_progress: OnProgress = lambda done, total, message: None) -> str:
+def stage_page(run_dir: Path) -> str:
     """Return the page of a finished run with everything in it; it works from a file, without a server or a network.
 
     Raises:
         UserError: the run is not finished, or a file of it cannot be used.
     """
-    on_progress(0, 2, "packing the scene")
-    pack = stage_pack(run_dir)
-    on_progress(1, 2, "writing the page")
-    return page_html(title_of(run_dir), pack, read_stage_document(run_dir))
+    return page_html(title_of(run_dir), stage_pack(run_dir), read_stage_document(run_dir))
 
 
 def page_html(
@@ -115,31 +107,16 @@ def script_text() -> str:
     return "\n" + "\n".join(parts)
 
 
-def write_page(run: StoredRun, path: Path, options: ExportOptions, progress: OnProgress) -> None:
+def write_page(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> Contents:
     """Write the page of a run: one file of a few megabytes."""
-    path.write_text(stage_page(run.run_dir, progress), encoding="utf-8")
-
-
-def read(run: StoredRun, path: Path) -> Contents:
-    """Read a page back and return what it holds.
-
-    Raises:
-        ReconstructionError: it is not what was to be written.
-    """
-    try:
-        found = SCENE.search(path.read_text(encoding="utf-8"))
-        if found is None:
-            raise ValueError("it holds no scene")
-        facts = json.loads(found.group(1))
-        block = base64.b64decode(facts["addresses"]["block"].partition(",")[2])
-        corners, vertices = unpacked_corners(block, facts["parts"]), facts["parts"]["places"]["count"]
-        if not len(corners) or corners.min() < 0 or corners.max() >= vertices:
-            raise ValueError("its triangles name places that are not there")
-    except READ_ERRORS as error:
-        raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
+    on_progress(0, 2, "packing the scene")
+    pack = stage_pack(run.run_dir)
+    on_progress(1, 2, "writing the page")
+    path.write_text(page_html(run.name, pack, read_stage_document(run.run_dir)), encoding="utf-8")
+    facts = pack.facts
     x, y, z = (float(e) for e in np.ptp(np.asarray(facts["bounds"]), axis=0))
     note = f"{len(facts['lights'])} lights, {UNIT_WORDS[run.unit]}; open it in any browser"
-    return Contents(len(corners) // 3, (x, y, z), note=note)
+    return Contents(facts["parts"]["corners"]["count"] // 3, (x, y, z), run.unit, note=note)
 
 
 def _json(value: Any) -> str:
