@@ -142,15 +142,12 @@ def light_matrix(light: Light, posed_camera: PosedCamera) -> Float[np.ndarray, "
     A directional light is placed far away.
     """
     middle = posed_camera.looked_at()
-    if light.position is not None:
-        place = light.position
-    else:
-        assert light.direction is not None
-        place = middle + light.direction * float(np.linalg.norm(middle - posed_camera.centre))
-    back = (place - middle) / np.linalg.norm(place - middle)
+    back, distance = light.seen_from(middle)
+    if light.position is None:
+        distance = float(np.linalg.norm(middle - posed_camera.centre))
     out = np.eye(4)
     out[:3, :3] = Rotation.align_vectors([back], [[0.0, 0.0, 1.0]])[0].as_matrix()
-    out[:3, 2], out[:3, 3] = back, place
+    out[:3, 2], out[:3, 3] = back, middle + distance * back
     return out
 
 

@@ -79,10 +79,9 @@ def write_rti(data: Dataset, out: Path, on_progress: OnProgress) -> None:
     kind, middle = kind_of(data.lights, "an RTI"), data.posed_camera.looked_at()
     away = float(np.linalg.norm(middle - data.posed_camera.centre))
     width = away * data.camera.width / data.camera.fx
-    rows = np.array([x.direction if x.position is None else x.position - middle for x in data.lights], float)
-    rows = data.posed_camera.world_from_camera.inverse().rotate(rows) @ BLENDER
-    directions = rows / np.linalg.norm(rows, axis=1, keepdims=True)
-    places = rows if kind == "point" else directions * away
+    ways, reach = zip(*(light.seen_from(middle) for light in data.lights), strict=True)
+    directions = data.posed_camera.world_from_camera.inverse().rotate(np.array(ways)) @ BLENDER
+    places = directions * (np.array(reach)[:, None] if kind == "point" else away)
     files = [f"{stem}.jpg" for stem in data.stems]
     _pictures(data, data.camera, out, ".jpg", on_progress)
     name = file_stem(data.run.run_dir)

@@ -146,9 +146,9 @@ def _turning(run: StoredRun, view: RenderView, new: NewLight) -> Iterator[Float[
     assert new.orbit is not None
     middle, calibration = studio_of(np.asarray(run.mesh.bounds)).centre, run.calibration
     used = [light for light in calibration.lights if light.used] or list(calibration.lights)
-    offsets = np.array([light.homogeneous()[:3] - light.homogeneous()[3] * middle for light in used])
-    elevation = float(np.median([direction_of(offset)[1] for offset in offsets]))
-    reach, first = float(np.median(np.linalg.norm(offsets, axis=1))), direction_of(offsets[0])[0]
+    ways, distances = zip(*(light.seen_from(middle) for light in used), strict=True)
+    elevation = float(np.median([direction_of(way)[1] for way in ways]))
+    reach, first = float(np.median(distances)), direction_of(ways[0])[0]
     w = used[0].homogeneous()[3]
     for k in range(new.orbit):
         way = reach * towards(first + 2 * math.pi * k / new.orbit, elevation)
