@@ -111,7 +111,7 @@ def test_a_point_seen_through_colmaps_files_is_where_our_camera_sees_it(finished
     assert len([line for line in lines[::2] if line]) == 4
 
 
-def test_every_camera_is_exported_where_it_stands_also_that_of_another_lie(finished, tmp_path):
+def test_every_camera_is_exported_where_it_stands_also_that_of_another_object_pose(finished, tmp_path):
     truth = finished[1]
     folder = laid_anew(tmp_path / "whole", truth)
     nerf, colmap = exported((folder, truth), "nerf", tmp_path), exported((folder, truth), "colmap", tmp_path)

@@ -90,7 +90,7 @@ def test_lit_ground_has_the_brightness_of_the_formula(capture):
 
 
 @pytest.mark.slow
-def test_views_and_lies_see_one_object_whose_motion_is_known(tmp_path):
+def test_views_and_object_poses_see_one_object_whose_motion_is_known(tmp_path):
     for name in ("mitsuba", "embreex"):
         pytest.importorskip(name, reason=f"{name} is not installed: pip install 'shadowgraph[generator]'")
     from examples.generator.capturing import make_capture
@@ -102,7 +102,7 @@ def test_views_and_lies_see_one_object_whose_motion_is_known(tmp_path):
         Flashlight(photos=2, radius=0.0),
         Exposure(ambient=0.0, indirect=False, noise=0.0, samples=4),
         further=Further(board_photos=2),
-        around=Around(views=2, lies=1, lie_views=2),
+        around=Around(views=2, object_poses=1, pose_views=2),
     )
     out = tmp_path / "boxes"
     make_capture(out, setup, lambda text: None)

@@ -65,7 +65,7 @@ def read_all(run: Path) -> list[str]:
     return [*said, *results.problems]
 
 
-def test_a_whole_run_of_several_views_and_lies_is_read_without_a_word(tmp_path):
+def test_a_whole_run_of_several_views_and_object_poses_is_read_without_a_word(tmp_path):
     run = damaged_runs.make_several(tmp_path)
     assert read_all(run) == []
     assert [name for name, _, _ in StoredRun(run).views] == ["view_1", "view_2", "turned_1"]

@@ -37,7 +37,7 @@ class Dataset:
     camera: Camera  # of the pictures
     photos: tuple[Path, ...] | None  # the capture's; None: the surface is relit
     calibration: Calibration  # of the view
-    fields: SolvedScene  # as the view saw them, in the world of its lie
+    fields: SolvedScene  # as the view saw them, in the world of its object pose
     view: str = ""
     further: tuple["Dataset", ...] = ()  # of the other views, where there are several
 
@@ -47,7 +47,7 @@ class Dataset:
         return PosedCamera(self.camera, self.calibration.world_from_camera, self.fields.ground_height)
 
     def in_common(self, matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        """Return world_from_something in the world of the first view: another than the view's own for another lie."""
+        """Return world_from_something in the world of the first view: not its own for another object pose."""
         motion = self.fields.object_from_world
         return matrix if motion is None else motion.matrix() @ matrix
 

@@ -98,7 +98,7 @@ def calibrate_source(source: Source, photos: Sequence[Photos], options: RunOptio
     def all_finished(some: CalibratedViews) -> CalibratedViews:
         return some.with_calibrations([finished(view.calibration) for view in some.views])
 
-    return replace(all_finished(views), lies=tuple(map(all_finished, views.lies)))
+    return replace(all_finished(views), object_poses=tuple(map(all_finished, views.object_poses)))
 
 
 def with_light_error(calibration: Calibration, relative: float) -> Calibration:
