@@ -1,7 +1,7 @@
 """CalibratedViews: the calibrations of several views of one object in one world, and their file.
 
 The file is calibration.json as Calibration writes it, for the first view; those of the others follow in
-`further_views`, those of further lies of the object in `lies`. A reader that knows one view finds the first.
+`further_views`, those of further object poses in `lies`. A reader that knows one view finds the first.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
 
 from calibration.calibration import Calibration, CalibrationFile, calibration_document
 from capture.files.atomic import write_json
 from capture.files.schema import LONGEST_NAME, Text, as_type, check_numbers, read_as, refused
-from capture.session.capture import MOST_LIES, MOST_VIEWS
+from capture.session.capture import MOST_OBJECT_POSES, MOST_VIEWS
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +27,12 @@ class CalibratedView:
 
 @dataclass(frozen=True, eq=False)
 class CalibratedViews:
-    """Views in one world frame (that of their board), in order; and the lies in which the object was laid anew."""
+    """Views in one world frame (that of their board), in order; and the object poses in which it was laid anew."""
 
     views: tuple[CalibratedView, ...]  # at least one
     left_out: tuple[tuple[str, str], ...] = ()  # views that are not used: name, and the sentence that says why
-    lies: tuple["CalibratedViews", ...] = ()  # each in the frame of its own board
-    name: str = ""  # of a lie
+    object_poses: tuple["CalibratedViews", ...] = ()  # each in the frame of its own board
+    name: str = ""  # of an object pose
 
     @property
     def first(self) -> Calibration:
@@ -40,8 +40,8 @@ class CalibratedViews:
         return self.views[0].calibration
 
     def every(self) -> tuple[CalibratedView, ...]:
-        """Return all views, those of the lies last."""
-        return (*self.views, *(view for lie in self.lies for view in lie.every()))
+        """Return all views, those of further object poses last."""
+        return (*self.views, *(view for one in self.object_poses for view in one.every()))
 
     def with_calibrations(self, calibrations: Sequence[Calibration]) -> "CalibratedViews":
         """Return the same views with other calibrations, in their order."""
@@ -81,8 +81,8 @@ def _document(views: CalibratedViews) -> dict[str, Any]:
         ({"view": view.name} if view.name else {}) | calibration_document(view.calibration) for view in views.views
     )
     left_out = [{"view": name, "reason": reason} for name, reason in views.left_out]
-    lies = [{"lie": lie.name} | _document(lie) for lie in views.lies]
-    more = {"further_views": further, "left_out": left_out, "lies": lies}
+    object_poses = [{"lie": one.name} | _document(one) for one in views.object_poses]
+    more = {"further_views": further, "left_out": left_out, "lies": object_poses}
     return document | {name: entries for name, entries in more.items() if entries}
 
 
@@ -106,11 +106,13 @@ class _View(CalibrationFile, kw_only=True):
 
 
 class _Views(_View, kw_only=True):
-    """The content of calibration.json, of all views and lies."""
+    """The content of calibration.json, of all views and object poses."""
 
     further_views: Annotated[tuple[_View, ...], Meta(max_length=MOST_VIEWS)] = ()
     left_out: Annotated[tuple[_LeftOut, ...], Meta(max_length=MOST_VIEWS)] = ()
-    lies: "Annotated[tuple[_Lie, ...], Meta(max_length=MOST_LIES)]" = ()
+    object_poses: "Annotated[tuple[_ObjectPose, ...], Meta(max_length=MOST_OBJECT_POSES)]" = field(
+        name="lies", default=()
+    )
 
     def __post_init__(self) -> None:
         CalibrationFile.__post_init__(self)
@@ -121,21 +123,21 @@ class _Views(_View, kw_only=True):
         names = [view.view for view in (self, *self.further_views)]
         if len(set(names)) < len(names):
             raise refused("further_views", names, "a name of its own for each view")
-        for k, lie in enumerate(self.lies):
-            if lie.lies:
-                raise refused(f"lies[{k}].lies", lie.lies, "no lies of a lie")
+        for k, one in enumerate(self.object_poses):
+            if one.object_poses:
+                raise refused(f"lies[{k}].lies", one.object_poses, "no object poses of an object pose")
 
     def views(self, document: Mapping[str, Any], name: str = "") -> CalibratedViews:
         """Return the views; `document` is the same content in JSON's types."""
         pairs = zip((self, *self.further_views), (document, *document.get("further_views", ())), strict=True)
-        lies = zip(self.lies, document.get("lies", ()), strict=True)
+        object_poses = zip(self.object_poses, document.get("lies", ()), strict=True)
         return CalibratedViews(
             tuple(CalibratedView(one.view, one.calibration(own)) for one, own in pairs),
             tuple((one.view, one.reason) for one in self.left_out),
-            tuple(lie.views(own, lie.lie) for lie, own in lies),
+            tuple(one.views(own, one.name) for one, own in object_poses),
             name,
         )
 
 
-class _Lie(_Views, kw_only=True):
-    lie: ViewName
+class _ObjectPose(_Views, kw_only=True):
+    name: ViewName = field(name="lie")

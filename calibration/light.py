@@ -41,6 +41,13 @@ class Light:
         assert self.direction is not None
         return np.append(self.direction, 0.0)
 
+    def seen_from(self, point: Vector) -> tuple[Vector, float]:
+        """Return the unit vector from a point to the light, and its distance: world length, 1 if directional."""
+        place = self.homogeneous()
+        way = place[:3] - place[3] * point
+        distance = float(np.linalg.norm(way))
+        return way / distance, distance if self.position is not None else 1.0
+
 
 def beam_gain(cosine: Float[np.ndarray, "*batch"], beam: tuple[float, ...]) -> Float[np.ndarray, "*batch"]:
     """Return g(c) of a radially symmetric flashlight: log g = m log c + r2 u^2 + r3 u^3 + ..., u = 1 - c.

@@ -84,10 +84,9 @@ def with_doubt(lights: Sequence[Light], posed_camera: PosedCamera, doubt: Doubt)
     if not doubt.share:
         return tuple(lights)
     middle = posed_camera.looked_at()
-    reach = [1.0 if one.position is None else float(np.linalg.norm(one.position - middle)) for one in lights]
     return tuple(
-        replace(one, sigma=np.sqrt(np.square(one.sigma) + (doubt.share * far) ** 2 / 3))
-        for one, far in zip(lights, reach, strict=True)
+        replace(one, sigma=np.sqrt(np.square(one.sigma) + (doubt.share * one.seen_from(middle)[1]) ** 2 / 3))
+        for one in lights
     )
 
 

@@ -36,7 +36,7 @@ STATIONS = replace(
     phone=replace(GOOD.phone, elevation=38.0),
     flashlight=replace(GOOD.flashlight, photos=1, around=(80.0, 81.0)),
     further=Further(board_photos=0),
-    around=Around(views=3, lies=1),
+    around=Around(views=3, object_poses=1),
 )
 PLACES = ("view_1", "view_2", "view_3", "turned_1")
 PLAN_PX, TABLE_PX = (360, 374), 96  # of a plan; half of its table or radius of its tray

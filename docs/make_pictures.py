@@ -5,9 +5,10 @@
     python docs/make_pictures.py --steps examples/spot runs/spot
     python docs/make_pictures.py --report runs/spot
 
-Of one view: a photo, the mesh from two sides, depth and normals. Of several views and lies: a photo of each, and the
-mesh from all sides. Together: a row for each run, which ends with the view relit from a place where no lamp was.
-Steps: what the method page shows of one run, from photo and shadows to the relit view. Report: two parts of its report.
+Of one view: a photo, the mesh from two sides, depth and normals. Of several views and object poses: a photo of each,
+and the mesh from all sides. Together: a row for each run, which ends with the view relit from a place where no lamp
+was. Steps: what the method page shows of one run, from photo and shadows to the relit view. Report: two parts of its
+report.
 """
 
 import argparse
@@ -76,7 +77,7 @@ def panels(run: Path) -> list[list[Image.Image]]:
     """The pictures of a run, row by row."""
     mesh = trimesh.load_mesh(run / "mesh.ply", process=False)
     found = load_views(run / "calibration.json")
-    places = [(view.name, view.calibration) for lie in (found, *found.lies) for view in lie.views]
+    places = [(view.name, view.calibration) for one in (found, *found.object_poses) for view in one.views]
     if len(places) > 1:
         photos = [photo_panel(run, name, calibration, SMALL, WIDE) for name, calibration in places]
         sides = [mesh_panel(mesh, azimuth, elevation) for azimuth, elevation in SIDES_DEG]

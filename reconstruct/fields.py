@@ -47,12 +47,12 @@ LAYOUTS = {
     "lobe_weights": Layout(torch.float16, (None, None, None), is_needed=False),
 }
 OF_A_VIEW = ("albedo", "world_from_camera", "lights", "lobe_weights")  # of a further camera: with its number, albedo_1
-OF_A_LIE = "object_from_world"  # of a further camera in another lie, with its number
+MOTION = "object_from_world"  # of a further camera of another object pose, with its number
 LAYOUTS |= {
     f"{name}_{number}": replace(LAYOUTS[name], is_needed=False) for number in range(1, MOST_VIEWS) for name in OF_A_VIEW
 }
 LAYOUTS |= {
-    f"{OF_A_LIE}_{number}": replace(LAYOUTS["world_from_camera"], is_needed=False) for number in range(1, MOST_VIEWS)
+    f"{MOTION}_{number}": replace(LAYOUTS["world_from_camera"], is_needed=False) for number in range(1, MOST_VIEWS)
 }
 
 
@@ -88,7 +88,7 @@ class FurtherView:
     world_from_camera: Pose
     lights: Float[Tensor, "photos 4"] | None = None
     gloss_weights: Float[Tensor, "height width materials"] | None = None  # of the lobes of SolvedScene.gloss
-    object_from_world: Pose | None = None  # of another lie: pose and lights are in its own world, see SolvedScene.views
+    object_from_world: Pose | None = None  # of another object pose: camera and lights are in its own world
 
     def scaled(self, factor: float) -> "FurtherView":
         """Return the same view in a unit of which `factor` are one of this one's."""
@@ -112,7 +112,7 @@ class FurtherView:
             "world_from_camera": torch.from_numpy(self.world_from_camera.matrix()),
             "lights": self.lights,
             "lobe_weights": None if self.gloss_weights is None else _half(self.gloss_weights),
-            OF_A_LIE: None if self.object_from_world is None else torch.from_numpy(self.object_from_world.matrix()),
+            MOTION: None if self.object_from_world is None else torch.from_numpy(self.object_from_world.matrix()),
         }
         return {name: tensor.contiguous() for name, tensor in found.items() if tensor is not None}
 
@@ -138,7 +138,7 @@ class SolvedScene:
     interreflection: float = 0.0  # true albedo over `albedo`, by the light that surfaces send each other; 0: none seen
     view: str = ""  # name of the camera's view, where there are several
     further: tuple[FurtherView, ...] = ()
-    object_from_world: Pose | None = None  # of one view of another lie: how its world lies in that of the other views
+    object_from_world: Pose | None = None  # of one view of another object pose: its motion to the others' world
     light_share: float = 0.0  # one sigma of a light's place over its distance, median over the photos
 
     @property
@@ -147,7 +147,7 @@ class SolvedScene:
         return PosedCamera(self.camera, self.world_from_camera, self.ground_height)
 
     def in_world(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return points of the frame that all views share in the world of this one: another for another lie."""
+        """Return points of the frame that all views share in the world of this one: another for another object pose."""
         return points if self.object_from_world is None else self.object_from_world.inverse().apply(points)
 
     def in_common(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -157,7 +157,7 @@ class SolvedScene:
     def views(self) -> "tuple[SolvedScene, ...]":
         """Return the scene as each of its cameras saw it: each one's albedo, gloss and lights, without the others'.
 
-        Where the object was laid anew, its surface is carried into that lie's world, in which the ground is level.
+        Where the object was laid anew, its surface is carried into that pose's world, in which the ground is level.
         """
         return self._each_view
 
@@ -335,8 +335,8 @@ def _checked_view(
         raise ValueError(f"{pixels} were found, {camera.width} x {camera.height} as of the camera were needed")
     refuse_outside(tensors, 0.0, BRIGHTEST, albedo_name, weights_name)
     refuse_outside(tensors, -LARGEST_LENGTH, LARGEST_LENGTH, lights_name)
-    pose, lie = _pose(tensors, pose_name), f"{OF_A_LIE}_{number}"
-    motion = _pose(tensors, lie) if lie in tensors else None
+    pose, moved = _pose(tensors, pose_name), f"{MOTION}_{number}"
+    motion = _pose(tensors, moved) if moved in tensors else None
     reach = MOST_BOXES * grid.spacing * max(grid.values.shape)
     place = pose.translation if motion is None else motion.apply(pose.translation)
     if np.abs(place - grid.origin.double().numpy()).max() > reach:

@@ -3,9 +3,9 @@
 A scene is what one camera sees, with its own lights, exposure and photos. Functions of the solver take one scene or a
 tuple of them: one is the same as a tuple of one. Photos and lights are numbered through all scenes, in their order.
 
-Where the object was laid anew, the scenes of that lie keep their own world, in which the ground is level: pictures are
-read there. Their `object_from_world` carries them into the frame of the surface (`placed`), in which rays are cast. A
-ray knows its length to its own ground, so that no code that casts rays needs a ground in that frame.
+Where the object was laid anew, the scenes of that object pose keep their own world, in which the ground is level:
+pictures are read there. Their `object_from_world` carries them into the frame of the surface (`placed`), in which rays
+are cast. A ray knows its length to its own ground, so that no code that casts rays needs a ground in that frame.
 """
 
 from dataclasses import replace

@@ -13,7 +13,6 @@ from tyro.conf import Positional, arg
 from capture.errors import CaptureError
 from reconstruct.export.export import ExportOptions, OnProgress, format_for, save
 from reconstruct.export.export import export as export_run
-from reconstruct.export.formats import DATASETS
 from reconstruct.run_folder.progress import progress
 from reconstruct.stored_run.refusal import refuse_no_run
 from shadowgraph.options import Command, Given, ResultFolder
@@ -78,7 +77,7 @@ class Relight(Command):
 
 def relight(command: Relight, console: Console) -> None:
     """Make the picture or video that was asked for, and say what is in it."""
-    from reconstruct.export.relit import NewLight, read, relit_file, write_relit
+    from reconstruct.export.relit import NewLight, relit_file, write_relit
 
     refuse_no_run(command.run)
     new = NewLight(
@@ -93,7 +92,7 @@ def relight(command: Relight, console: Console) -> None:
     file = relit_file(command.run, new, command.out)
     with _shown("relight", console) as on_progress:
         write = lambda run, draft: write_relit(run, draft, new, command.width, on_progress)  # noqa: E731
-        print_lines(console, save(command.run, file, write, read).sentence())
+        print_lines(console, save(command.run, file, write).sentence())
 
 
 def export(command: Export, console: Console) -> None:
@@ -103,13 +102,7 @@ def export(command: Export, console: Console) -> None:
     options = ExportOptions(*sizes, command.photos, command.print_size)
     name = format_for(command.file, command.format)
     with _shown(name, console) as on_progress:
-        if name in DATASETS and command.file is not None and not command.file.suffix:
-            from reconstruct.export.datasets import export_folder
-
-            said = export_folder(command.run, name, command.file, options, on_progress)
-        else:
-            said = export_run(command.run, name, command.file, options, on_progress).sentence()
-        print_lines(console, said)
+        print_lines(console, export_run(command.run, name, command.file, options, on_progress).sentence())
 
 
 @contextmanager

@@ -94,9 +94,9 @@ def make_several(folder: Path) -> Path:
     own = replace(own, side_views=(_side_view(own),))
     lights = tuple(replace(x, position=back.apply(np.array(x.position))) for x in own.lights)
     turned = replace(own, world_from_camera=back @ own.world_from_camera, lights=lights, side_views=())
-    lie = CalibratedViews((CalibratedView("turned_1", turned),), name="turned_1")
+    object_pose = CalibratedViews((CalibratedView("turned_1", turned),), name="turned_1")
     views = (CalibratedView("view_1", own), CalibratedView("view_2", own))
-    save_views(CalibratedViews(views, (("view_3", "no board was found"),), (lie,)), run / "calibration.json")
+    save_views(CalibratedViews(views, (("view_3", "no board was found"),), (object_pose,)), run / "calibration.json")
     fields = load_fields(run / "fields.safetensors")
     poses = {"view_2": (own.world_from_camera, None), "turned_1": (turned.world_from_camera, motion)}
     further = tuple(

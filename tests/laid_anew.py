@@ -1,4 +1,4 @@
-"""A finished run of one camera that photographed the object in two lies, from the same place of the object's frame."""
+"""A finished run of one camera that photographed two object poses, from the same place of the object's frame."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,11 +16,13 @@ def laid_anew(folder: Path, truth: Truth) -> Path:
     """Write the run; the views are view_1 and turned_1, and told in the object's frame they are the same."""
     folder.mkdir()
     motion = Pose(Rotation.from_euler("z", 40, degrees=True).as_matrix(), np.array([80.0, -30.0, 0.0]))
-    own, back = truth.calibration, motion.inverse()  # the same camera and lights, told in the world of another lie
+    own, back = truth.calibration, motion.inverse()  # the same camera and lights, in another object pose's world
     lights = tuple(replace(x, position=back.apply(np.array(x.position))) for x in own.lights)
     turned = replace(own, world_from_camera=back @ own.world_from_camera, lights=lights)
-    lie = CalibratedViews((CalibratedView("turned_1", turned),), name="turned_1")
-    save_views(CalibratedViews((CalibratedView("view_1", own),), lies=(lie,)), folder / "calibration.json")
+    object_pose = CalibratedViews((CalibratedView("turned_1", turned),), name="turned_1")
+    save_views(
+        CalibratedViews((CalibratedView("view_1", own),), object_poses=(object_pose,)), folder / "calibration.json"
+    )
     fields = replace(fields_of(truth), view="view_1")
     there = FurtherView("turned_1", fields.albedo, fields.camera, turned.world_from_camera, object_from_world=motion)
     save_fields(replace(fields, further=(there,)), folder / "fields.safetensors")

@@ -171,9 +171,9 @@ READERS = (
     "reconstruct.tensor_file",  # tensors of a run
     "reconstruct.stored_run.",  # everything else of a run
     "reconstruct.evaluate.",  # the truth, and a reference mesh that a person names
-    "reconstruct.export.",  # what was just written, read back as a check, and a map that a person names
-    "reconstruct.mesh.",  # the same
-    "viewer.stage.page",  # the same, and the page's own parts
+    "reconstruct.export.",  # what is packed into an archive, and a map that a person names
+    "reconstruct.mesh.",  # files of a package that is being written
+    "viewer.stage.page",  # the page's own parts
     "reconstruct.run_folder.",  # lock, log and hashes of what a run itself writes
     "reconstruct.run.batch",  # the log of a run that it started
 )

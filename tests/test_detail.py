@@ -261,7 +261,7 @@ def turned(ball, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def both(ball, detail, turned, tmp_path_factory):
-    """The fields of both lies, whose common albedo is brighter than the photos' own, and the detail of each."""
+    """The fields of both object poses, whose common albedo is brighter than the photos' own, and the detail of each."""
     other, motion = turned
     further = FurtherView("turned_1", 1.3 * ball.fields.albedo, ball.fields.camera, ball.fields.world_from_camera)
     fields = replace(ball.fields, view="view_1", further=(replace(further, object_from_world=motion),))

@@ -174,12 +174,14 @@ def test_the_glb_is_in_metres_y_up_with_linear_colours_and_no_metal(tmp_path):
     mesh = extract_mesh(solved(sphere_grid(height=20)))
     save_mesh(mesh, tmp_path / "mesh.ply", tmp_path / "mesh.glb", "mm")
     document, binary = glb_parts(tmp_path / "mesh.glb")
-    vertices = accessor(document, binary, 0, "<f4", 3)
+    named = document["meshes"][0]["primitives"][0]["attributes"]
+    vertices = accessor(document, binary, named["POSITION"], "<f4", 3)
     assert np.allclose(vertices.mean(0), [0, 0.02, 0], atol=1e-4)
     assert np.allclose(
         vertices, np.c_[mesh.vertices[:, 0], mesh.vertices[:, 2], -mesh.vertices[:, 1]] / 1000, atol=1e-6
     )
-    colours = accessor(document, binary, 2, "<u2", 4) / 65535
+    colours = accessor(document, binary, named["COLOR_0"], "<u2", 4) / 65535
+    assert document["accessors"][named["COLOR_0"]]["normalized"]
     assert np.allclose(colours[0], [*RED, 1], atol=0.004)  # through 8-bit sRGB
     material = document["materials"][document["meshes"][0]["primitives"][0]["material"]]["pbrMetallicRoughness"]
     assert (material["metallicFactor"], material["roughnessFactor"]) == (0, 1)

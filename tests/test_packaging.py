@@ -78,15 +78,15 @@ def test_the_readme_is_short_and_says_windows_paths_once():
 
 
 @pytest.mark.parametrize(
-    ("name", "views", "lies"), [("spot", [""], []), ("cow", ["view_1", "view_2", "view_3"], ["turned_1"])]
+    ("name", "views", "object_poses"), [("spot", [""], []), ("cow", ["view_1", "view_2", "view_3"], ["turned_1"])]
 )
-def test_an_example_is_small_and_complete(name, views, lies):
+def test_an_example_is_small_and_complete(name, views, object_poses):
     folder = ROOT / "examples" / name
     files = [p for p in folder.rglob("*") if p.is_file()]
     assert sum(p.stat().st_size for p in files) <= 6_000_000
     assert {p.parent.name for p in files} == {name, "board", "photos"}  # no truth beside them
     capture = load_capture(folder)
-    assert [view.name for view in capture.views] == views and [lie.name for lie in capture.lies] == lies
+    assert [view.name for view in capture.views] == views and [one.name for one in capture.object_poses] == object_poses
     assert all(len(session.lit) >= ADVISED_LIT and session.board for session in capture.sessions())
 
 

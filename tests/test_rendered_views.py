@@ -1,4 +1,4 @@
-"""Rendered captures of several views, from the folder to the calibrations: cameras, faults, lies."""
+"""Rendered captures of several views, from the folder to the calibrations: cameras, faults, object poses."""
 
 import json
 import shutil
@@ -23,14 +23,14 @@ SMALL = Setup(
     Flashlight(photos=7, radius=0.0),
     Exposure(ambient=0.0, indirect=False, samples=4),
     further=Further(board_photos=3),
-    around=Around(views=3, lies=1),
+    around=Around(views=3, object_poses=1),
 )
 pytestmark = pytest.mark.slow  # rendering takes half a minute
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
-    """Three views and a lie; in the second view the tripod was pushed for one photo."""
+    """Three views and an object pose; in the second view the tripod was pushed for one photo."""
     for name in ("mitsuba", "embreex"):
         pytest.importorskip(name, reason=f"{name} is not installed: pip install 'shadowgraph[generator]'")
     from examples.generator.capturing import make_capture
@@ -48,11 +48,11 @@ def calibrated(folder):
     return source, photos, calibrate_source(source, photos, DRAFT)
 
 
-def test_views_and_a_lie_are_calibrated_in_their_boards_frames_and_a_pushed_tripod_is_named(capture, tmp_path):
+def test_views_and_an_object_pose_are_calibrated_in_their_boards_frames_and_a_pushed_tripod_is_named(capture, tmp_path):
     source, photos, views = calibrated(capture)
     assert [view.name for view in views.views] == ["view_1", "view_2", "view_3"]
-    assert [lie.name for lie in views.lies] == ["turned_1"] and not views.left_out
-    for view in (*views.views, *views.lies[0].views):
+    assert [one.name for one in views.object_poses] == ["turned_1"] and not views.left_out
+    for view in (*views.views, *views.object_poses[0].views):
         truth = json.loads((capture / "gt" / view.name / "camera.json").read_text())["stored"]
         off = view.calibration.world_from_camera.translation - truth["centre_mm"]
         assert np.linalg.norm(off) < 4.0, view.name  # of 520 mm, with pictures of 400 px

@@ -11,11 +11,9 @@ import zipfile
 from pathlib import Path
 
 import damaged_runs
-import numpy as np
 import pytest
 import strange_runs
 import torch
-import trimesh
 from confined import limited
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -28,10 +26,8 @@ from capture.files.atomic import atomic_file
 from reconstruct import tensor_file
 from reconstruct.export.export import export
 from reconstruct.fields import load_fields
-from reconstruct.mesh.mesh import vertex_colours
 from reconstruct.run.bundle import write_bundle
 from reconstruct.stored_run.maps import read_thumbnail
-from reconstruct.stored_run.ply import read_mesh
 from reconstruct.stored_run.stored_run import StoredRun
 from reconstruct.tensor_file import Layout, read_tensors, write_tensors
 from viewer.display.run_follower import RunFollower, status
@@ -69,21 +65,10 @@ def read_all(run: Path) -> list[str]:
     return [*said, *results.problems]
 
 
-def test_a_whole_run_of_several_views_and_lies_is_read_without_a_word(tmp_path):
+def test_a_whole_run_of_several_views_and_object_poses_is_read_without_a_word(tmp_path):
     run = damaged_runs.make_several(tmp_path)
     assert read_all(run) == []
     assert [name for name, _, _ in StoredRun(run).views] == ["view_1", "view_2", "turned_1"]
-
-
-def test_the_mesh_of_a_run_is_read_as_trimesh_reads_it(whole):
-    found, wanted = read_mesh(whole / "mesh.ply"), trimesh.load_mesh(whole / "mesh.ply", process=False)
-    assert isinstance(wanted, trimesh.Trimesh)
-    assert np.array_equal(found.vertices, wanted.vertices) and np.array_equal(found.faces, wanted.faces)
-    assert np.array_equal(vertex_colours(found), vertex_colours(wanted))
-    assert np.array_equal(found.vertex_normals, wanted.vertex_normals)
-    columns = wanted.metadata["_ply_raw"]["vertex"]["data"]
-    for name in ("evidence", "sigma"):
-        assert np.array_equal(found.vertex_attributes[name], columns[name])
 
 
 @settings(

@@ -47,7 +47,7 @@ def capture_of(folder: Path, *places: str) -> Path:
 # --- folders ---------------------------------------------------------------------------------------------------------
 
 
-def test_views_and_lies_are_read_in_natural_order_and_one_view_is_a_capture_of_one(tmp_path):
+def test_views_and_object_poses_are_read_in_natural_order_and_one_view_is_a_capture_of_one(tmp_path):
     folder = capture_of(
         tmp_path / "all", "view_1", "view_10", "view_2", "turned_1", "turned_2/view_1", "turned_2/view_2"
     )
@@ -56,12 +56,12 @@ def test_views_and_lies_are_read_in_natural_order_and_one_view_is_a_capture_of_o
     (folder / "session.toml").write_text('board = "checkerboard:9x6:24.25"')
     capture = load_capture(folder)
     assert [session.name for session in capture.views] == ["view_1", "view_2", "view_10"]
-    assert [lie.name for lie in capture.lies] == ["turned_1", "turned_2"]
+    assert [one.name for one in capture.object_poses] == ["turned_1", "turned_2"]
     assert [s.name for s in capture.sessions()][3:] == ["turned_1", "turned_2/view_1", "turned_2/view_2"]
     assert all(session.settings.board == "checkerboard:9x6:24.25" for session in capture.sessions())
     assert len(capture.board) == 2 and [len(session.side) for session in capture.views] == [1, 1, 1]
     alone = load_capture(folder / "view_2")
-    assert alone.views[0].name == "" and alone.views[0].lit == capture.views[1].lit and not alone.lies
+    assert alone.views[0].name == "" and alone.views[0].lit == capture.views[1].lit and not alone.object_poses
     source = open_source(folder, RunOptions())
     assert len(source.views()) == 6 and len(source.photos()) == 24
     assert len(content_hash(source.files(RunOptions()))) == len(source.files(RunOptions())) == 6 * 5 + 2 + 3 + 1
@@ -148,8 +148,8 @@ def calibration(place=PLACES[0], photo="a.jpg") -> Calibration:
 def views() -> CalibratedViews:
     names = ("view_1", "view_2", "view_3")
     some = tuple(CalibratedView(n, calibration(p, f"{n}.jpg")) for n, p in zip(names, PLACES, strict=True))
-    lie = CalibratedViews((CalibratedView("turned_1", calibration(PLACES[2], "t.jpg")),), name="turned_1")
-    return CalibratedViews(some, (("view_4", "no board found"),), (lie,))
+    object_pose = CalibratedViews((CalibratedView("turned_1", calibration(PLACES[2], "t.jpg")),), name="turned_1")
+    return CalibratedViews(some, (("view_4", "no board found"),), (object_pose,))
 
 
 def test_the_file_of_several_views_returns_them_and_a_reader_of_one_view_finds_the_first(tmp_path):
@@ -158,8 +158,8 @@ def test_the_file_of_several_views_returns_them_and_a_reader_of_one_view_finds_t
     there = load_views(path)
     assert [view.name for view in there.views] == ["view_1", "view_2", "view_3"]
     assert all(a.calibration == b.calibration for a, b in zip(here.views, there.views, strict=True))
-    assert there.left_out == here.left_out and there.lies[0].name == "turned_1"
-    assert there.lies[0].first == here.lies[0].first and load_calibration(path) == here.first
+    assert there.left_out == here.left_out and there.object_poses[0].name == "turned_1"
+    assert there.object_poses[0].first == here.object_poses[0].first and load_calibration(path) == here.first
     assert there.views[1].calibration.residuals == here.views[1].calibration.residuals
 
 
@@ -177,7 +177,7 @@ def test_the_file_of_one_view_is_that_of_a_calibration(tmp_path):
         (lambda d: d["further_views"][1].update(view="view_2"), "a name of its own"),
         (lambda d: d["further_views"][0].update(view="../view_2"), "the name of a f"),
         (lambda d: d["further_views"][0]["camera"].pop("fx"), r"further_views\[0\].camera.fx is missing"),
-        (lambda d: d["lies"][0].update(lies=[d["lies"][0].copy()]), "no lies of a lie"),
+        (lambda d: d["lies"][0].update(lies=[d["lies"][0].copy()]), "no object poses of an object pose"),
         (lambda d: d.update(further_views=[{}] * 1000), "further_views"),
     ],
 )

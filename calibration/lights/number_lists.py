@@ -55,6 +55,20 @@ def number_rows(path: Path, posed_camera: PosedCamera) -> Rows:
 def text_rows(text: str, path: Path, posed_camera: PosedCamera) -> Rows:
     """Parse RTI's .lp, DiLiGenT's light_directions.txt and tables (.csv), whose head may name angles or places.
 
+    Raises:
+        CalibrationError: as `named_numbers`.
+    """
+    names, vectors, head = named_numbers(text, path)
+    if head.kind == "angles":
+        vectors, note = head.vectors(vectors, path)
+        return Rows(names, turned(vectors, posed_camera), "directional", note=note)
+    kind = head.kind or ("" if path.suffix.lower() == ".csv" else "directional")
+    return _rows(names, vectors, kind, head.unit, path.name, posed_camera)
+
+
+def named_numbers(text: str, path: Path) -> tuple[tuple[str | None, ...], Float[np.ndarray, "rows columns"], "Head"]:
+    """Return the name (or none) and the numbers of each line as they stand, and the columns that hold them.
+
     Decimal commas are read (in tables between semicolons); names may hold spaces.
 
     Raises:
@@ -80,12 +94,7 @@ def text_rows(text: str, path: Path, posed_camera: PosedCamera) -> Rows:
         values.append(value)
     if not values:
         raise CalibrationError(f"{path} lists no light; a line 'name x y z' for each photo is needed. {READABLE}.")
-    vectors = np.array(values)
-    if head.kind == "angles":
-        vectors, note = head.vectors(vectors, path)
-        return Rows(tuple(names), turned(vectors, posed_camera), "directional", note=note)
-    kind = head.kind or ("" if path.suffix.lower() == ".csv" else "directional")
-    return _rows(tuple(names), vectors, kind, head.unit, path.name, posed_camera)
+    return tuple(names), np.array(values), head
 
 
 @dataclass(frozen=True)

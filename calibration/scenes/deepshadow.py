@@ -9,6 +9,7 @@ from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.known_scene import Importer, KnownScene
 from calibration.light import Light
+from calibration.lights.number_lists import named_numbers
 from calibration.pose import Pose
 from calibration.scenes.distant_camera import LOOKING_DOWN
 from capture.errors import CalibrationError
@@ -20,9 +21,6 @@ from capture.session.scene_photos import scene_photos
 LIGHTS, PARAMETERS, PICTURES = "all_object_lights.txt", "params.json", "0"
 BACKGROUND = 0.5  # of the silhouette's white: darker pixels are bare ground
 BELOW_LIGHTS = 0.5  # of the distance from the camera to the nearest light: the assumed place of the relief
-
-
-Row = tuple[str, np.ndarray]  # of all_object_lights.txt: a name, and the light's place, world
 
 
 def _recognised(folder: Path) -> str | None:
@@ -51,47 +49,31 @@ def load_deepshadow(folder: Path) -> KnownScene:
     Raises:
         CalibrationError: a file or field is missing or impossible; the message names both.
     """
-    rows = _rows(folder / LIGHTS)
-    pictures = [inside(folder, f"{PICTURES}/{name}_shadow1.png", str(folder / LIGHTS)) for name, _ in rows]
-    usable = scene_photos(pictures)
-    shadow, rows = tuple(usable.paths), [rows[row] for row in usable.rows]
+    names, places, _ = named_numbers(read_text(folder / LIGHTS), folder / LIGHTS)
+    if None in names:
+        raise CalibrationError(
+            f"{folder / LIGHTS}, light {names.index(None) + 1} has no name; 'name x y z' was needed."
+        )
+    usable = scene_photos([inside(folder, f"{PICTURES}/{one}_shadow1.png", str(folder / LIGHTS)) for one in names])
+    shadow, places = tuple(usable.paths), places[usable.rows]
     height, width = read_grey(shadow[0]).shape
     given = read_scene(folder / PARAMETERS, _Parameters)
     focal = given.focal_length
     eye = np.array([given.cam_location_x, given.cam_location_y, given.cam_location_z])
     camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
-    lights = tuple(Light(path.name, "point", position=place) for (_, place), path in zip(rows, shadow, strict=True))
-    nearest = min(float(np.linalg.norm(place - eye)) for _, place in rows)
-    lowest = min(float(place[2]) for _, place in rows)
-    ground = min(eye[2] - BELOW_LIGHTS * nearest, lowest - 0.5 * BELOW_LIGHTS * nearest)
+    lights = tuple(Light(path.name, "point", position=place) for place, path in zip(places, shadow, strict=True))
+    nearest = float(np.linalg.norm(places - eye, axis=1).min())
+    ground = min(eye[2] - BELOW_LIGHTS * nearest, float(places[:, 2].min()) - 0.5 * BELOW_LIGHTS * nearest)
     return KnownScene(
         Calibration(camera, Pose(LOOKING_DOWN, eye), float(ground), lights, unit="scene"),
         rgb_paths=None,
         shadow_paths=shadow,
-        mask_path=_silhouette(folder, rows[0][0]),
+        mask_path=_silhouette(folder, usable.paths[0].name),
         photos_left_out=usable.left_out,
         every_photo=usable.every,
         mask_is_grey=True,
         ground_known=False,
     )
-
-
-def _rows(path: Path) -> list[Row]:
-    rows = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        words = line.split()
-        if not words:
-            continue
-        try:
-            position = np.array([float(word) for word in words[1:]])
-        except ValueError:
-            position = np.zeros(0)
-        if position.shape != (3,) or not np.isfinite(position).all() or Path(words[0]).name != words[0]:
-            raise CalibrationError(f"{path}, line {number} is {line[:60]!r}; a name and x y z of its light are needed.")
-        rows.append((words[0], position))
-    if not rows:
-        raise CalibrationError(f"{path} names no picture; a line 'name x y z' for each is needed.")
-    return rows
 
 
 def _silhouette(folder: Path, first: str) -> Path | None:

@@ -16,6 +16,7 @@ from calibration.lights.photo_lists import dark_photos, folders_of, match, photo
 from calibration.scenes.distant_camera import distant_light, distant_scene, picture_camera
 from capture.decode.formats import decode
 from capture.errors import CalibrationError
+from capture.files.regular import why
 from capture.files.schema import read_text
 from capture.session.scene_photos import scene_photos
 
@@ -85,22 +86,16 @@ def _table(path: Path, n_rows: int | None = None) -> Float[np.ndarray, "rows 3"]
     Raises:
         CalibrationError: anything else, or another number of rows than was needed.
     """
-    rows = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        try:
-            row = [float(word) for word in line.replace(",", " ").split()]
-        except ValueError as error:
-            raise CalibrationError(f"{path}, line {number} is {line[:60]!r}; three numbers were needed.") from error
-        if row:
-            rows.append(row)
-    widths = {len(row) for row in rows}
-    table = np.array(rows) if len(widths) == 1 else np.zeros((0, 0))
+    try:
+        table = np.loadtxt(read_text(path).replace(",", " ").splitlines(), ndmin=2)
+    except ValueError as error:
+        raise CalibrationError(f"{path}: three numbers in each line were needed ({why(error)}).") from error
     if table.shape[0] == 3 and table.shape[1] != 3:
         table = table.T
-    if table.ndim != 2 or table.shape[1:] != (3,) or not len(table) or not np.isfinite(table).all():
+    if table.shape[1] != 3 or not len(table) or not np.isfinite(table).all():
         raise CalibrationError(
-            f"{path} holds {len(rows)} rows of {sorted(widths)[:4]} numbers; three finite ones per row (or three rows "
-            "of one column per photo) were needed."
+            f"{path} holds {' x '.join(map(str, table.shape))} numbers; three finite ones per row (or three rows of "
+            "one column per photo) were needed."
         )
     if n_rows is not None and len(table) != n_rows:
         raise CalibrationError(f"{path} holds {len(table)} rows, {n_rows} were needed: one for each light.")

@@ -28,7 +28,7 @@ def calibrate_views(
     board_spec: str | None = None,
     lights: str = "auto",
 ) -> CalibratedViews:
-    """Calibrate the views of a capture in the frame of its board, and those of each lie in the frame of that lie's.
+    """Calibrate the views of a capture in the frame of its board; those of each object pose in the frame of its own.
 
     A view that cannot be calibrated, or does not agree with the others, is named in `left_out`.
 
@@ -41,18 +41,18 @@ def calibrate_views(
     """
     count = len(capture.views)
     own, rest = photos[:count], photos[count:]
-    views = _one_lie(capture, own, board_spec, lights)
-    lies = []
-    for lie in capture.lies:
-        own, rest = rest[: len(lie.views)], rest[len(lie.views) :]
+    views = _one_object_pose(capture, own, board_spec, lights)
+    object_poses = []
+    for one in capture.object_poses:
+        own, rest = rest[: len(one.views)], rest[len(one.views) :]
         try:
-            lies.append(replace(_one_lie(lie, own, board_spec, lights), name=lie.name))
+            object_poses.append(replace(_one_object_pose(one, own, board_spec, lights), name=one.name))
         except (CalibrationError, CaptureError) as error:
-            views = replace(views, left_out=(*views.left_out, (lie.name, str(error))))
-    return replace(views, lies=tuple(lies))
+            views = replace(views, left_out=(*views.left_out, (one.name, str(error))))
+    return replace(views, object_poses=tuple(object_poses))
 
 
-def _one_lie(
+def _one_object_pose(
     capture: Capture, photos: Sequence[ViewPhotos | CaptureError], board_spec: str | None, lights: str
 ) -> CalibratedViews:
     """Calibrate the views between which nothing moved but the camera."""

@@ -11,7 +11,7 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from numpy.lib import format as npy
 
 from capture.errors import CalibrationError
@@ -37,7 +37,7 @@ def read_npy(path: Path, largest: int = LARGEST_FILE) -> Float[np.ndarray, "..."
     try:
         if path.stat().st_size > largest:
             raise _too_large(path, largest)
-        return _numbers(path.read_bytes())
+        return parse_npy(path.read_bytes()).astype(float)
     except _DAMAGED as error:
         raise CalibrationError(f"{path} is no readable array of numbers ({why(error)}); export it again.") from error
 
@@ -60,7 +60,7 @@ def read_npz(path: Path, names: tuple[str, ...], largest: int = LARGEST_FILE) ->
                     f"{path} holds {in_one_line(', '.join(sorted(found)[:8])[:200]) or 'nothing'}; "
                     f"{', '.join(missing)} was needed."
                 )
-            return {name: _numbers(_unpacked(packed, found[name])) for name in names}
+            return {name: parse_npy(_unpacked(packed, found[name])).astype(float) for name in names}
     except _DAMAGED as error:
         raise CalibrationError(f"{path} cannot be read ({why(error)}); {', '.join(names)} were needed.") from error
 
@@ -121,24 +121,24 @@ def _unpacked(packed: zipfile.ZipFile, part: zipfile.ZipInfo) -> bytes:
         return stream.read(part.file_size)
 
 
-def _numbers(data: bytes) -> Float[np.ndarray, "..."]:
-    """Parse the bytes of a .npy file.
+def parse_npy(data: bytes) -> Shaped[np.ndarray, "..."]:
+    """Return the numbers in the bytes of a .npy file, of its kind and shape; nothing in it is unpickled.
 
     Raises:
-        ValueError: header and size do not agree, or the entries are not numbers.
+        Exception: header and size do not agree, or the entries are not numbers; a header is Python text, and what
+            parses it raises many kinds.
     """
     stream = io.BytesIO(data)
     version = npy.read_magic(stream)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"version {version} of the format")
     read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    shape, _, kind = read_header(stream)
+    shape, is_by_column, kind = read_header(stream)
     if kind.kind not in NUMBERS or kind.hasobject:
         raise ValueError(f"its entries are {kind}, numbers were needed")
     if min(shape, default=0) < 0 or math.prod(shape) * kind.itemsize != len(data) - stream.tell():
         raise ValueError(f"the shape {shape} does not fit its {len(data)} bytes")
-    stream.seek(0)
-    return np.asarray(npy.read_array(stream, allow_pickle=False), dtype=float)
+    return np.frombuffer(data, kind, offset=stream.tell()).reshape(shape, order="F" if is_by_column else "C")
 
 
 def _too_large(path: Path, largest: int) -> CalibrationError:

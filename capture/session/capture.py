@@ -1,4 +1,4 @@
-"""Read a capture: a session for each place of the tripod, and for each further lie of the object.
+"""Read a capture: a session for each place of the tripod, and for each further object pose.
 
     my_object/
       session.toml                 common to all
@@ -39,26 +39,26 @@ from capture.session.session import (
     photos_in,
 )
 
-VIEWS, LIES = "view_", "turned_"  # beginnings of folder names
+VIEWS, TURNED = "view_", "turned_"  # beginnings of folder names
 PUSHED = 0.1  # of the picture's width: less is a pushed tripod, more shows other sides of the object
-MOST_VIEWS, MOST_LIES = 24, 8
+MOST_VIEWS, MOST_OBJECT_POSES = 24, 8
 
 
 @dataclass(frozen=True)
 class Capture:
-    """The sessions of one object: between `views` only the camera moves; in each of `lies` the object lies anew."""
+    """The sessions of one object: the camera moves between `views`; in each of `object_poses` the object lies anew."""
 
     folder: Path
     views: tuple[Session, ...]  # in order; at least one
     board: tuple[Path, ...] = ()  # photos of the board for the lens alone, common to all views
-    lies: tuple["Capture", ...] = ()
+    object_poses: tuple["Capture", ...] = ()
     left_out: tuple[tuple[str, str], ...] = ()  # views that are no session: name, and the sentence that says why
     settings: SessionSettings = field(default_factory=SessionSettings)
-    name: str = ""  # of a lie
+    name: str = ""  # of an object pose
 
     def sessions(self) -> tuple[Session, ...]:
-        """Return every session, those of the lies included."""
-        return (*self.views, *(session for lie in self.lies for session in lie.sessions()))
+        """Return every session, those of all object poses included."""
+        return (*self.views, *(session for one in self.object_poses for session in one.sessions()))
 
 
 def load_capture(folder: Path, seen: SeenPhotos | None = None) -> Capture:
@@ -74,26 +74,27 @@ def load_capture(folder: Path, seen: SeenPhotos | None = None) -> Capture:
     """
     refuse_no_folder(folder, "the folder that holds the photos")
     seen = SeenPhotos() if seen is None else seen
-    views, lies = folders_named(folder, VIEWS), folders_named(folder, LIES)
-    if not views and not lies:
+    views, object_poses = folders_named(folder, VIEWS), folders_named(folder, TURNED)
+    if not views and not object_poses:
         session = load_session(folder, seen=seen)
         sessions, board = by_place(session, seen)
         return Capture(folder, sessions, board, settings=session.settings)
-    _refuse_unclear(folder, views, lies)
+    _refuse_unclear(folder, views, object_poses)
     settings = load_settings(folder)
     if settings.roles and views:
         raise CaptureError(
-            f"{folder / 'session.toml'} names roles, and the photos are in {(views or lies)[0].name}/: roles are "
-            f"needed there. Move them into {(views or lies)[0].name}/session.toml, names as in that folder."
+            f"{folder / 'session.toml'} names roles, and the photos are in {(views or object_poses)[0].name}/: "
+            f"roles are needed there. Move them into {(views or object_poses)[0].name}/session.toml, names as in that "
+            "folder."
         )
     capture = _of_views(folder, views, settings, (), "", seen)
-    anew = (_of_views(one, folders_named(one, VIEWS), settings, capture.board, one.name, seen) for one in lies)
-    capture = replace(capture, lies=tuple(anew))
+    anew = (_of_views(one, folders_named(one, VIEWS), settings, capture.board, one.name, seen) for one in object_poses)
+    capture = replace(capture, object_poses=tuple(anew))
     count = len(capture.sessions())
     if count > MOST_VIEWS:
         raise CaptureError(
-            f"{folder} holds {count} places of the tripod, those of {LIES}* included; at most {MOST_VIEWS} are solved "
-            "together. Remove those that show least."
+            f"{folder} holds {count} places of the tripod, those of {TURNED}* included; at most {MOST_VIEWS} are "
+            "solved together. Remove those that show least."
         )
     return capture
 
@@ -104,17 +105,17 @@ def folders_named(folder: Path, beginning: str) -> list[Path]:
     return sorted((path for path in found if path.name[len(beginning) :].isdecimal()), key=natural_order)
 
 
-def _refuse_unclear(folder: Path, views: list[Path], lies: list[Path]) -> None:
+def _refuse_unclear(folder: Path, views: list[Path], object_poses: list[Path]) -> None:
     """Refuse photos whose view is unclear, and more folders than anybody photographs."""
     if views and (folder / ROLE_FOLDERS["lit"]).is_dir():
         raise CaptureError(
             f"{folder} holds photos/ beside {views[0].name}/; each view's photos were needed in its own folder. Move "
             f"photos/ and its board photo into {VIEWS}{len(views) + 1}/, or remove it."
         )
-    if len(views) > MOST_VIEWS or len(lies) > MOST_LIES:
+    if len(views) > MOST_VIEWS or len(object_poses) > MOST_OBJECT_POSES:
         raise CaptureError(
-            f"{folder} holds {len(views)} folders {VIEWS}* and {len(lies)} folders {LIES}*; at most {MOST_VIEWS} and "
-            f"{MOST_LIES} are read. Remove those that show least."
+            f"{folder} holds {len(views)} folders {VIEWS}* and {len(object_poses)} folders {TURNED}*; at most "
+            f"{MOST_VIEWS} and {MOST_OBJECT_POSES} are read. Remove those that show least."
         )
 
 
@@ -124,7 +125,7 @@ def _of_views(
     """Return the capture of these views' folders; without any, the folder itself is a view.
 
     Args:
-        name: of a lie, as its views are called in sentences.
+        name: of an object pose, as its views are called in sentences.
 
     Raises:
         CaptureError: none of them can be read.

@@ -1,7 +1,7 @@
 """Render captures of several tripod places, and of the object laid on other sides: view_1/, view_2/, turned_1/.
 
-Between views nothing moves but the tripod (unless --pushed says so). For each lie, object and board lie anew; a lie's
-world is its own board's frame. docs/capture.md says how a person takes such photos.
+Between views nothing moves but the tripod (unless --pushed says so). For each object pose, object and board lie anew;
+its world is its own board's frame. docs/capture.md says how a person takes such photos.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from .sheet import lay
 from .shooting import Place, take_board, take_photos
 
 NUMBERS = 500  # of photos per place: names of one capture differ
-FEWEST_DEGREES = 25.0  # between two lies: by less the object would have rocked only
+FEWEST_DEGREES = 25.0  # between two object poses: by less the object would have rocked only
 RESTS_TRIED = 30
 Say = Callable[[str], None]
 
@@ -34,7 +34,7 @@ def make_views(out: Path, ready: Stage, say: Say) -> None:
         CaptureError: the object has too few sides to lie on.
     """
     setup, board = ready.setup, ready.board
-    motions = lies(ready.thing, setup.around.lies)
+    motions = object_poses(ready.thing, setup.around.object_poses)
     rng = np.random.default_rng([setup.seed, 1])
     fixed = poses.tripod(setup, board, ready.thing)
     shared = {f"IMG_{i:04d}.jpg": v for i, v in enumerate(poses.handheld(fixed, board, setup, rng), 2)}
@@ -48,18 +48,18 @@ def make_views(out: Path, ready: Stage, say: Say) -> None:
     for index, motion in enumerate(motions):
         name, taken = f"turned_{index + 1}", len(seen)
         laid = _laid(ready, motion, index)
-        seen |= _views(out, laid, name, setup.around.lie_views, taken, truth.Rays(laid.thing), say)
+        seen |= _views(out, laid, name, setup.around.pose_views, taken, truth.Rays(laid.thing), say)
         truth.write_motion(out / "gt" / name, _motion(laid.thing.vertices, ready.thing.vertices))
     truth.write_seen(out / "gt", seen)
 
 
 def _views(
-    out: Path, ready: Stage, lie: str, count: int, taken: int, rays: truth.Rays, say: Say
+    out: Path, ready: Stage, object_pose: str, count: int, taken: int, rays: truth.Rays, say: Say
 ) -> dict[str, Bool[np.ndarray, " faces"]]:
     """Render the places of the tripod around the object as it lies now.
 
     Args:
-        lie: folder of the lie, in which each of several views has its own; "" for the first lie.
+        object_pose: its folder, in which each of several views has its own; "" for the first.
         taken: places that were rendered before.
 
     Returns:
@@ -67,10 +67,10 @@ def _views(
     """
     seen = {}
     for index in range(count):
-        own = f"view_{index + 1}" if count > 1 or not lie else ""
-        name = "/".join(filter(None, (lie, own)))
+        own = f"view_{index + 1}" if count > 1 or not object_pose else ""
+        name = "/".join(filter(None, (object_pose, own)))
         say(name)
-        stood = ready if lie and count == 1 else _at_place(ready, index, count, is_first=not lie)
+        stood = ready if object_pose and count == 1 else _at_place(ready, index, count, is_first=not object_pose)
         view = _take(Place(out / name, out / "gt" / name, (taken + index) * NUMBERS), stood, say)
         seen[name] = truth.faces_seen(rays if stood.thing is ready.thing else truth.Rays(stood.thing), view)
     return seen
@@ -89,7 +89,7 @@ def _take(place: Place, ready: Stage, say: Say) -> poses.Viewpoint:
 
 
 def _at_place(ready: Stage, index: int, count: int, is_first: bool) -> Stage:
-    """Return the scene with the tripod at one of its places; what goes wrong does so around the first lie alone."""
+    """Return the scene with the tripod at one of its places; what goes wrong does so in the first object pose alone."""
     around, setup = ready.setup.around, ready.setup
     apart = 360.0 / count if around.apart is None else around.apart
     phone = replace(setup.phone, azimuth=setup.phone.azimuth + index * apart)
@@ -119,7 +119,7 @@ def _faultless(setup: Setup) -> Setup:
     return replace(setup, hand=Hand(), exposure=replace(setup.exposure, moved=()))
 
 
-def lies(mesh: trimesh.Trimesh, count: int) -> list[np.ndarray]:
+def object_poses(mesh: trimesh.Trimesh, count: int) -> list[np.ndarray]:
     """Return rotations (4x4) that lay a mesh on other sides, on which it rests.
 
     Raises:
@@ -138,7 +138,7 @@ def lies(mesh: trimesh.Trimesh, count: int) -> list[np.ndarray]:
             rotation[:3, :3] = pose[:3, :3]
             out.append(rotation)
     if len(out) < count:
-        raise CaptureError(f"--lies {count}: the object rests on {len(out)} other sides. Ask for fewer.")
+        raise CaptureError(f"--object-poses {count}: the object rests on {len(out)} other sides. Ask for fewer.")
     return out[:count]
 
 
@@ -173,4 +173,4 @@ def refuse_impossible(setup: Setup, board: AnyBoard) -> None:
     table, further = setup.table, setup.further
     if setup.has_places() and (table.wall > 0 or table.edge > 0 or further.side_photos or further.light_photos):
         without = "--wall, --edge, --side-photos and --light-photos"
-        raise CaptureError(f"--views and --lies go without {without} ({board.spec()}).")
+        raise CaptureError(f"--views and --object-poses go without {without} ({board.spec()}).")

@@ -92,10 +92,10 @@ def _refuse_impossible(setup: Setup) -> None:
         ("--board-photos", further.board_photos, MOST_BOARD_PHOTOS),
         ("--side-photos", further.side_photos, MOST_SIDE_PHOTOS),
         ("--views", setup.around.views, MOST_PLACES),
-        ("--lies", setup.around.lies, MOST_PLACES),
+        ("--object-poses", setup.around.object_poses, MOST_PLACES),
     ):
         if not 0 <= count <= most:
             raise CaptureError(f"{name} {count}: give 0 to {most}.")
-    if not 1 <= setup.around.lie_views <= MOST_PLACES:
-        raise CaptureError(f"--lie-views {setup.around.lie_views}: give 1 to {MOST_PLACES}.")
+    if not 1 <= setup.around.pose_views <= MOST_PLACES:
+        raise CaptureError(f"--pose-views {setup.around.pose_views}: give 1 to {MOST_PLACES}.")
     hand.refuse_impossible(setup)

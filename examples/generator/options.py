@@ -203,9 +203,9 @@ class Around:
     """Places of the tripod around the object, into view_1/, view_2/ and so on; the board stays beside the object."""
     apart: float | None = None
     """Degrees from one place to the next; evenly all around unless given."""
-    lies: int = 0
+    object_poses: int = 0
     """Times that the object is laid on another side, into turned_1/ and so on."""
-    lie_views: int = 1
+    pose_views: int = 1
     """Places of the tripod around each of these; of several each has its own folder, turned_1/view_1/ and so on."""
     pushed: float = 0.0
     """The object is pushed by so many mm before the last view."""
@@ -237,8 +237,8 @@ class Setup:
         return np.random.default_rng([self.seed, *name.encode()])
 
     def has_places(self) -> bool:
-        """Return whether the capture has several views or lies, each in a folder of its own."""
-        return self.around.views > 1 or self.around.lies > 0
+        """Return whether the capture has several views or object poses, each in a folder of its own."""
+        return self.around.views > 1 or self.around.object_poses > 0
 
     def is_beside(self) -> bool:
         """Return whether the object stands beside the board, not where the board was."""

@@ -179,7 +179,7 @@ def faces_seen(rays: Rays, view: Viewpoint) -> Bool[np.ndarray, " faces"]:
 
 
 def write_motion(folder: Path, object_from_turned: Float[np.ndarray, "4 4"]) -> None:
-    """Write pose.json: the rigid motion between two lies of the object, each in its own board frame, mm."""
+    """Write pose.json: the rigid motion between two object poses, each in its own board frame, mm."""
     back = np.linalg.inv(object_from_turned)
     note = "X_object = T_object_from_turned X_turned, where X_object is where the same point lay during view_*"
     pose = {"T_object_from_turned": object_from_turned.tolist(), "T_turned_from_object": back.tolist(), "note": note}

@@ -161,8 +161,7 @@ def _close_pairs(views: CalibratedViews, foot: Vector) -> tuple[tuple[str, str, 
 
 def directions(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "lights 3"]:
     """Return the unit vectors from the object's centre (world) to each light, world."""
-    ways = [light.direction if light.position is None else light.position - centre for light in calibration.lights]
-    return np.array([way / np.linalg.norm(way) for way in ways if way is not None])
+    return np.array([light.seen_from(centre)[0] for light in calibration.lights])
 
 
 def widest_gap(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> tuple[float, float]:

@@ -122,8 +122,7 @@ def capture_facts(calibration: Calibration, findings: Sequence[Finding], cover: 
     used = [light for light in calibration.lights if light.used]
     ways = directions(calibration, cover.centre)[[light.used for light in calibration.lights]]
     elevation = np.degrees(np.arcsin(np.clip(ways[:, 2], -1, 1))) if len(ways) else np.zeros(0)
-    reach = [1.0 if x.position is None else float(np.linalg.norm(x.position - cover.centre)) for x in used]
-    sigma = [float(np.linalg.norm(light.sigma)) / distance for light, distance in zip(used, reach, strict=True)]
+    sigma = [float(np.linalg.norm(light.sigma)) / light.seen_from(cover.centre)[1] for light in used]
     kinds = Counter(finding.kind for finding in findings)
     left_out = {finding.photo.name for finding in findings if finding.drop and finding.role == "lit"}
     return {

@@ -57,7 +57,7 @@ class Detail:
     posed_camera: PosedCamera  # of the window
     window: Window  # in the photos
     view: int = 0  # of SolvedScene.views()
-    object_from_world: Pose | None = None  # of another lie's view, see SolvedScene.views; None: the world of the others
+    object_from_world: Pose | None = None  # of a view of another object pose; None: the world of the others
 
     def in_world(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return points of the frame that all views share in the world of this one."""

@@ -37,7 +37,7 @@ class Dataset:
     camera: Camera  # of the pictures
     photos: tuple[Path, ...] | None  # the capture's; None: the surface is relit
     calibration: Calibration  # of the view
-    fields: SolvedScene  # as the view saw them, in the world of its lie
+    fields: SolvedScene  # as the view saw them, in the world of its object pose
     view: str = ""
     further: tuple["Dataset", ...] = ()  # of the other views, where there are several
 
@@ -47,7 +47,7 @@ class Dataset:
         return PosedCamera(self.camera, self.calibration.world_from_camera, self.fields.ground_height)
 
     def in_common(self, matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        """Return world_from_something in the world of the first view: another than the view's own for another lie."""
+        """Return world_from_something in the world of the first view: not its own for another object pose."""
         motion = self.fields.object_from_world
         return matrix if motion is None else motion.matrix() @ matrix
 
@@ -142,15 +142,12 @@ def light_matrix(light: Light, posed_camera: PosedCamera) -> Float[np.ndarray, "
     A directional light is placed far away.
     """
     middle = posed_camera.looked_at()
-    if light.position is not None:
-        place = light.position
-    else:
-        assert light.direction is not None
-        place = middle + light.direction * float(np.linalg.norm(middle - posed_camera.centre))
-    back = (place - middle) / np.linalg.norm(place - middle)
+    back, distance = light.seen_from(middle)
+    if light.position is None:
+        distance = float(np.linalg.norm(middle - posed_camera.centre))
     out = np.eye(4)
     out[:3, :3] = Rotation.align_vectors([back], [[0.0, 0.0, 1.0]])[0].as_matrix()
-    out[:3, 2], out[:3, 3] = back, place
+    out[:3, 2], out[:3, 3] = back, middle + distance * back
     return out
 
 

@@ -17,12 +17,11 @@ from scipy.spatial.transform import Rotation
 from calibration.camera import Camera
 from calibration.lights.layouts import BLENDER
 from calibration.pose import Pose
-from capture.errors import ReconstructionError
-from capture.files.atomic import atomic_folder, write_json
+from capture.files.atomic import write_json
 from capture.files.title import file_stem
 from capture.photos.photo import encode_srgb, write_picture
 from reconstruct.export.dataset import Dataset, centred, kind_of, light_matrix, open_dataset, opengl
-from reconstruct.export.export import Contents, ExportOptions, OnProgress, reading_back
+from reconstruct.export.export import Contents, ExportOptions, OnProgress, Writer
 from reconstruct.export.solid import ZIP_TIME
 from reconstruct.render.g_buffer import look, surface_maps
 from reconstruct.stored_run.stored_run import StoredRun
@@ -80,10 +79,9 @@ def write_rti(data: Dataset, out: Path, on_progress: OnProgress) -> None:
     kind, middle = kind_of(data.lights, "an RTI"), data.posed_camera.looked_at()
     away = float(np.linalg.norm(middle - data.posed_camera.centre))
     width = away * data.camera.width / data.camera.fx
-    rows = np.array([x.direction if x.position is None else x.position - middle for x in data.lights], float)
-    rows = data.posed_camera.world_from_camera.inverse().rotate(rows) @ BLENDER
-    directions = rows / np.linalg.norm(rows, axis=1, keepdims=True)
-    places = rows if kind == "point" else directions * away
+    ways, reach = zip(*(light.seen_from(middle) for light in data.lights), strict=True)
+    directions = data.posed_camera.world_from_camera.inverse().rotate(np.array(ways)) @ BLENDER
+    places = directions * (np.array(reach)[:, None] if kind == "point" else away)
     files = [f"{stem}.jpg" for stem in data.stems]
     _pictures(data, data.camera, out, ".jpg", on_progress)
     name = file_stem(data.run.run_dir)
@@ -208,68 +206,34 @@ def _nerf_lens(camera: Camera) -> dict[str, float]:
     }
 
 
-# --- the table, folders and archives ---------------------------------------------------------------------------------
-
-LAYOUTS: dict[str, Callable[[Dataset, Path, OnProgress], None]] = {
-    "shadowneus": write_shadowneus,
-    "rti": write_rti,
-    "colmap": write_colmap,
-    "nerf": write_nerf,
-}
+# --- folders and archives --------------------------------------------------------------------------------------------
 
 
-OF_ALL_VIEWS = ("colmap", "nerf")  # the others have one camera: the first view's
+def _writer(layout: Callable[[Dataset, Path, OnProgress], None], of_all_views: bool = False) -> Writer:
+    """Return the function that writes a layout as a folder, or as a zip of it if the path ends in .zip."""
 
-
-def export_folder(run_dir: Path, name: str, out: Path, options: ExportOptions, on_progress: OnProgress) -> str:
-    """Write a run as a folder in one of LAYOUTS, whole or not at all; return a sentence about it.
-
-    Raises:
-        ReconstructionError: the run is not finished, the layout cannot represent it, or the folder is not empty.
-    """
-    if not (run_dir / "mesh.ply").is_file():
-        raise ReconstructionError(f"{run_dir / 'mesh.ply'} is not there; the folder of a finished run was needed.")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ReconstructionError(f"{out} exists and is not empty; a new folder was needed. Name another one.")
-    data = open_dataset(StoredRun(run_dir), options.photos)
-    with atomic_folder(out) as draft:
-        LAYOUTS[name](data, draft, on_progress)
-    source = "of the relit surface" if data.photos is None else "of the capture"
-    count = sum(len(view.lights) for view in (data.every() if name in OF_ALL_VIEWS else (data,)))
-    return f"{out}: {count} pictures {source}, {data.camera.width} x {data.camera.height} pixels, and lights"
-
-
-def _zipped(name: str) -> Callable[[StoredRun, Path, ExportOptions, OnProgress], None]:
-    def write(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+    def write(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> Contents:
         data = open_dataset(run, options.photos)
         with tempfile.TemporaryDirectory() as place:
-            folder = Path(place) / path.stem
+            folder = Path(place) / path.stem if path.suffix else path
             folder.mkdir()
-            LAYOUTS[name](data, folder, on_progress)
-            with zipfile.ZipFile(path, "w") as archive:
-                for file in sorted(part for part in folder.rglob("*") if part.is_file()):
-                    name_inside = file.relative_to(place).as_posix()
-                    archive.writestr(zipfile.ZipInfo(name_inside, ZIP_TIME), file.read_bytes(), zipfile.ZIP_DEFLATED)
+            layout(data, folder, on_progress)
+            if path.suffix:
+                with zipfile.ZipFile(path, "w") as archive:
+                    for file in sorted(part for part in folder.rglob("*") if part.is_file()):
+                        entry = zipfile.ZipInfo(file.relative_to(place).as_posix(), ZIP_TIME)
+                        archive.writestr(entry, file.read_bytes(), zipfile.ZIP_DEFLATED)
+        count = sum(len(view.lights) for view in (data.every() if of_all_views else (data,)))
+        source = "of the relit surface" if data.photos is None else "of the capture"
+        return Contents(
+            pixels=(data.camera.width, data.camera.height), note=f"{count} pictures {source}, camera and lights"
+        )
 
-    write.__doc__ = f"The layout {name} as a zip file."
     return write
 
 
-shadowneus, rti, colmap, nerf = (_zipped(name) for name in LAYOUTS)
-
-
-def read(run: StoredRun, path: Path) -> Contents:
-    """Read back the contents of a zip of a data set.
-
-    Raises:
-        ReconstructionError: it cannot be read back.
-    """
-    with reading_back(path), zipfile.ZipFile(path) as packed:
-        names = packed.namelist()
-        if (broken := packed.testzip()) is not None:
-            raise ValueError(f"{broken} is damaged")
-    pictures = sum(Path(name).suffix in (".jpg", ".png") for name in names)
-    return Contents(note=f"{pictures} pictures, camera and lights")
+shadowneus, rti = _writer(write_shadowneus), _writer(write_rti)  # of one camera: the first view's
+colmap, nerf = _writer(write_colmap, of_all_views=True), _writer(write_nerf, of_all_views=True)
 
 
 def _pictures(data: Dataset, camera: Camera, folder: Path, suffix: str, on_progress: OnProgress) -> None:

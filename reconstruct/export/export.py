@@ -1,28 +1,21 @@
-"""export: write a finished run in one of FORMATS, and read the file back as a check."""
+"""export: write a finished run in one of FORMATS."""
 
 import importlib
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-from xml.etree.ElementTree import ParseError
 
-import cv2
-
-from capture.decode.limits import BrokenFile
 from capture.errors import ReconstructionError
-from capture.files.atomic import atomic_file
+from capture.files.atomic import atomic_file, atomic_folder
 from capture.files.title import file_stem
 from reconstruct.export.formats import FORMATS
 from reconstruct.stored_run.stored_run import MESH, StoredRun
 
 UNIT_WORDS = {"mm": "mm", "scene": "units of the scene"}
 MEGABYTE = 1e6
-READ_ERRORS = (OSError, ValueError, LookupError, TypeError, zipfile.BadZipFile, ParseError, cv2.error, BrokenFile)
 
 OnProgress = Callable[[int, int, str], None]  # done, total, what is being done
 
@@ -45,22 +38,19 @@ class Contents:
     """Countable contents of a file; None: does not apply."""
 
     faces: int | None = None
-    extents: tuple[float, float, float] | None = None  # along the world's x, y, z, in the world's unit
+    extents: tuple[float, float, float] | None = None  # along the world's x, y, z
+    unit: str = "mm"  # of the extents: "mm" | "scene"
     is_closed: bool | None = None
     pixels: tuple[int, int] | None = None  # width, height
     frames: int | None = None
     note: str = ""  # further facts: units and axes of the file, range of values
 
-    def sentence(self, unit: str) -> str:
-        """Return the contents as a readable sentence.
-
-        Args:
-            unit: of the run, "mm" | "scene".
-        """
+    def sentence(self) -> str:
+        """Return the contents as a readable sentence."""
         parts = []
         if self.extents is not None:
-            parts.append(" x ".join(f"{e:.1f}" if unit == "mm" else f"{e:.4g}" for e in self.extents))
-            parts[-1] += f" {UNIT_WORDS[unit]}"
+            parts.append(" x ".join(f"{e:.1f}" if self.unit == "mm" else f"{e:.4g}" for e in self.extents))
+            parts[-1] += f" {UNIT_WORDS[self.unit]}"
         if self.faces is not None:
             parts.append(f"{self.faces:,} triangles")
         if self.is_closed is not None:
@@ -80,16 +70,15 @@ class FinishedExport:
     companions: tuple[Path, ...]  # other files that belong to it, in the same folder
     size_bytes: int  # of all of them
     contents: Contents
-    unit: str  # "mm" | "scene"
 
     def sentence(self) -> str:
-        """Return a sentence about the export, as read back from the file."""
+        """Return a sentence about the export."""
         others = "".join(f" and {path.name}" for path in self.companions)
         return f"{self.path}{others}: {self.about()}"
 
     def about(self) -> str:
         """Return size and contents in words."""
-        return f"{self.size_bytes / MEGABYTE:.2f} MB, {self.contents.sentence(self.unit)}"
+        return f"{self.size_bytes / MEGABYTE:.2f} MB, {self.contents.sentence()}"
 
 
 def as_one_file(written: FinishedExport) -> Path:
@@ -103,8 +92,7 @@ def as_one_file(written: FinishedExport) -> Path:
     return archive
 
 
-Writer = Callable[[StoredRun, Path, ExportOptions, OnProgress], None]  # to this path; other files go beside it
-Reader = Callable[[StoredRun, Path], Contents]  # raises ReconstructionError if the file is not as expected
+Writer = Callable[[StoredRun, Path, ExportOptions, OnProgress], Contents]  # to this path; other files go beside it
 
 
 def format_for(file: Path | None, name: str | None) -> str:
@@ -117,7 +105,7 @@ def format_for(file: Path | None, name: str | None) -> str:
         return name
     suffix = "" if file is None else file.suffix.lower()
     for candidate, row in FORMATS.items():
-        if name is None and suffix in (row.suffix, *row.others):
+        if name is None and suffix and suffix in (row.suffix, *row.others):
             return candidate
     asked = f"'{name}'" if name is not None else f"'{suffix}'" if file is not None else "no format"
     raise ReconstructionError(f"{asked} was asked for; one of {', '.join(FORMATS)} was needed (--format).")
@@ -139,7 +127,7 @@ def export(
     options: ExportOptions | None = None,
     on_progress: OnProgress = lambda done, total, message: None,
 ) -> FinishedExport:
-    """Write a finished run in one of FORMATS; whole, or not at all; then read it back.
+    """Write a finished run in one of FORMATS; whole, or not at all.
 
     Args:
         name: in FORMATS.
@@ -147,30 +135,29 @@ def export(
         on_progress: callback (done, total, message).
 
     Raises:
-        ReconstructionError: the run is not finished, the file cannot be written there, or does not read back.
+        ReconstructionError: the run is not finished, or the file cannot be written there.
     """
     row = FORMATS[name]
     target = default_file(run_dir, name) if file is None else file
     if target.suffix.lower() not in (row.suffix, *row.others):
-        endings = " or ".join((row.suffix, *row.others))
+        endings = " or ".join(ending or "nothing (a folder)" for ending in (row.suffix, *row.others))
         raise ReconstructionError(f"{target}: a file of format {name} ends in {endings}. Name it so.")
-    writer, chosen = _imported(row.writer), options or ExportOptions()
-    written = save(run_dir, target, lambda run, draft: writer(run, draft, chosen, on_progress), _imported(row.reader))
-    if chosen.print_size is None or "print_size" not in row.takes:
-        return written
-    note = "millimetres, z up" + written.contents.note.partition(", z up")[2]  # a scene's unit is scaled away
-    return replace(written, unit="mm", contents=replace(written.contents, note=f"scaled to print, {note}"))
+    module, function = row.writer.split(":")
+    writer: Writer = getattr(importlib.import_module(module), function)
+    chosen = options or ExportOptions()
+    return save(run_dir, target, lambda run, draft: writer(run, draft, chosen, on_progress))
 
 
-def save(run_dir: Path, target: Path, write: Callable[[StoredRun, Path], None], read: "Reader") -> FinishedExport:
-    """Write a file made from a finished run, whole or not at all; then read it back.
+def save(run_dir: Path, target: Path, write: Callable[[StoredRun, Path], Contents]) -> FinishedExport:
+    """Write a file or folder made from a finished run, whole or not at all.
 
     Args:
         target: its folder must exist, unless it is inside the run's folder.
         write: writes to a draft in an empty folder, with companion files beside it.
 
     Raises:
-        ReconstructionError: the run is not finished, or the folder does not exist; also errors of write and read.
+        ReconstructionError: the run is not finished, the folder does not exist, or the target is a folder that is not
+            empty; also errors of `write`.
     """
     run = StoredRun(run_dir)
     if not (run_dir / MESH).exists():
@@ -179,33 +166,19 @@ def save(run_dir: Path, target: Path, write: Callable[[StoredRun, Path], None], 
         raise ReconstructionError(
             f"{target.parent} is not a folder; {target.name} was to be written there. Make it first."
         )
+    if not target.suffix and target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise ReconstructionError(f"{target} exists and is not empty; a new folder was needed. Name another one.")
     with tempfile.TemporaryDirectory() as place:
         draft = Path(place) / target.name
-        write(run, draft)
-        contents = read(run, draft)
+        contents = write(run, draft)
+        if draft.is_dir():
+            with atomic_folder(target) as folder:
+                shutil.copytree(draft, folder, dirs_exist_ok=True)
+            size = sum(part.stat().st_size for part in target.rglob("*") if part.is_file())
+            return FinishedExport(target, (), size, contents)
         parts = sorted(path for path in Path(place).iterdir() if path != draft)
         for part in [*parts, draft]:  # the main file last: if it exists, so do the others
             with atomic_file(target.parent / part.name) as temporary:
                 shutil.copyfile(part, temporary)
         size = sum(part.stat().st_size for part in [*parts, draft])
-    return FinishedExport(target, tuple(target.parent / part.name for part in parts), size, contents, run.unit)
-
-
-@contextmanager
-def reading_back(path: Path) -> Iterator[None]:
-    """Turn what fails while a file is read that was just written into one sentence.
-
-    Raises:
-        ReconstructionError: it cannot be read back.
-    """
-    try:
-        yield
-    except READ_ERRORS as error:
-        why = error.reason if isinstance(error, BrokenFile) else error
-        raise ReconstructionError(f"{path.name} does not read back ({why}). Check the disk, export again.") from error
-
-
-def _imported(reference: str) -> Any:
-    """Import the function that "module:function" names."""
-    module, function = reference.split(":")
-    return getattr(importlib.import_module(module), function)
+    return FinishedExport(target, tuple(target.parent / part.name for part in parts), size, contents)

@@ -8,27 +8,22 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Format:
-    """One row of FORMATS: a kind of file, and the functions that write it and read it back."""
+    """One row of FORMATS: a kind of file, and the function that writes it."""
 
     suffix: str  # with its dot
     title: str  # for people who do not know the format's name
     about: str  # in one sentence
     writer: str  # "module:function", a reconstruct.export.export.Writer; imported when it is used
-    others: tuple[str, ...] = ()  # further suffixes that the same writer supports
+    others: tuple[str, ...] = ()  # further suffixes that the same writer supports; "" of a folder
     ending: str = ""  # of the file's name before the suffix, where formats share a suffix
     takes: tuple[str, ...] = ()  # names of the ExportOptions that change the file
-
-    @property
-    def reader(self) -> str:
-        """The function that reads it back, a reconstruct.export.export.Reader: `read` of the writer's module."""
-        return f"{self.writer.partition(':')[0]}:read"
 
 
 _FACES, _PRINTED, _SKINNED = ("faces",), ("faces", "print_size"), ("faces", "texture")
 _LOOK, _MOVES = ("width", "lamp_size"), ("width", "frames", "lamp_size")
 _SOLID, _SKIN, _MAPS = "reconstruct.export.solid", "reconstruct.export.textured", "reconstruct.export.maps"
 _FILM, _DATA = "reconstruct.export.film", "reconstruct.export.datasets"
-_VIDEO = (".webm", ".gif")
+_VIDEO, _FOLDER = (".webm", ".gif"), ("",)
 FORMATS: dict[str, Format] = {
     "glb": Format(
         ".glb",
@@ -129,14 +124,12 @@ FORMATS: dict[str, Format] = {
         "_normals",
     ),
     "shadowneus": Format(
-        ".zip", "ShadowNeuS", "Photos, camera, lights, ground.", f"{_DATA}:shadowneus", (), "_shadowneus"
+        ".zip", "ShadowNeuS", "Photos, camera, lights, ground.", f"{_DATA}:shadowneus", _FOLDER, "_shadowneus"
     ),
-    "rti": Format(".zip", "RTI (relight, OpenLIME)", "Photos, .lp, .dome.", f"{_DATA}:rti", (), "_rti"),
-    "colmap": Format(".zip", "COLMAP (text)", "Camera, photos, points.", f"{_DATA}:colmap", (), "_colmap"),
-    "nerf": Format(".zip", "NeRF (transforms)", "Photos, camera, light.", f"{_DATA}:nerf", (), "_nerf"),
+    "rti": Format(".zip", "RTI (relight, OpenLIME)", "Photos, .lp, .dome.", f"{_DATA}:rti", _FOLDER, "_rti"),
+    "colmap": Format(".zip", "COLMAP (text)", "Camera, photos, points.", f"{_DATA}:colmap", _FOLDER, "_colmap"),
+    "nerf": Format(".zip", "NeRF (transforms)", "Photos, camera, light.", f"{_DATA}:nerf", _FOLDER, "_nerf"),
     "depth-exr": Format(
         ".exr", "Depth (EXR)", "How far each pixel is, as exact numbers.", f"{_MAPS}:depth", (), "_depth"
     ),
 }
-
-DATASETS = tuple(name for name, row in FORMATS.items() if row.writer.startswith(_DATA))  # a folder, or a zip of it

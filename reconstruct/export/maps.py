@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt16
 
-from capture.decode.exr import read_exr, write_exr
+from capture.decode.exr import write_exr
 from capture.errors import ReconstructionError
-from reconstruct.export.export import Contents, ExportOptions, OnProgress, reading_back
+from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, OnProgress
 from reconstruct.stored_run.maps import DEPTH, NORMALS, read_depth, read_normals
 from reconstruct.stored_run.stored_run import DETAIL, StoredRun
 
@@ -25,7 +25,7 @@ FRAME = "world: right-handed, z up, ground level"
 NORMAL_CODE = "R, G, B = x, y, z of the unit normal: value / 65535 * 2 - 1; 0 0 0 where no object is seen"
 
 
-def normals(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def normals(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> Contents:
     """Write world normals: channels N.X, N.Y, N.Z and A (the object) of an EXR, or 16 bits per channel of a PNG."""
     on_progress(0, 1, "normals")
     values = _normals(run)
@@ -36,73 +36,30 @@ def normals(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnP
     else:
         coded = np.where(seen[..., None], np.round((values + 1) / 2 * FULL), 0).astype(np.uint16)
         _write_png(run, path, coded, {"content": "normals", "coding": NORMAL_CODE})
+    return _contents(seen, "unit normals, world frame")
 
 
-def depth(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def depth(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> Contents:
     """Write z-depth along the camera's axis: channels Z and A (the object) of an EXR, or 16 bits of a PNG."""
     on_progress(0, 1, "depth")
     values = read_depth(run.run_dir / DEPTH)
     seen = np.isfinite(values)
+    near, far = _range(values, seen)
     if path.suffix.lower() == ".exr":
         channels = {"Z": np.where(seen, values, 0).astype(np.float32), "A": seen.astype(np.float32)}
         write_exr(path, channels, _header(run, "z-depth along the camera's axis, 0 where no object is seen"))
-        return
-    near, far = _range(values, seen)
-    step = (far - near) / (FARTHEST - NEAREST)
-    coded = np.where(seen, np.round((np.where(seen, values, near) - near) / step) + NEAREST, NO_DEPTH)
-    code = "z-depth = offset + scale * value; value 0: no object is seen"
-    facts = {"content": "depth", "coding": code, "scale": step, "offset": near - NEAREST * step}
-    _write_png(run, path, coded.astype(np.uint16), facts)
+    else:
+        step = (far - near) / (FARTHEST - NEAREST)
+        coded = np.where(seen, np.round((np.where(seen, values, near) - near) / step) + NEAREST, NO_DEPTH)
+        code = "z-depth = offset + scale * value; value 0: no object is seen"
+        facts = {"content": "depth", "coding": code, "scale": step, "offset": near - NEAREST * step}
+        _write_png(run, path, coded.astype(np.uint16), facts)
+    return _contents(seen, f"z-depth {near:.4g} to {far:.4g} {UNIT_WORDS[run.unit]}")
 
 
-def read(run: StoredRun, path: Path) -> Contents:
-    """Read back the contents of a map and compare it with the run's own maps.
-
-    Raises:
-        ReconstructionError: it cannot be read, or differs by more than its quantisation step.
-    """
-    with reading_back(path):
-        is_depth, found = (decode_exr if path.suffix.lower() == ".exr" else decode_png)(path)
-    wanted = read_depth(run.run_dir / DEPTH) if is_depth else _normals(run)
-    there = np.isfinite(wanted) if is_depth else (wanted != 0).any(-1)
-    step = float(np.ptp(wanted[there])) / FULL if is_depth else 2 / FULL
-    if found.shape != wanted.shape or np.abs(found[there] - wanted[there]).max() > step:
-        raise ReconstructionError(f"{path.name} reads back with other values. Check the disk, export again.")
-    height, width = wanted.shape[:2]
-    unit = "mm" if run.unit == "mm" else "units of the scene"
-    low, high = (float(found[there].min()), float(found[there].max())) if is_depth else (-1.0, 1.0)
-    said = f"z-depth {low:.4g} to {high:.4g} {unit}" if is_depth else "unit normals, world frame"
-    return Contents(pixels=(width, height), note=f"{said}; {int(there.sum()):,} pixels show the object")
-
-
-def decode_png(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
-    """Decode a PNG and its sidecar: return True if it is depth, and the values (inf: no depth; 0: no normal).
-
-    Raises:
-        OSError, ValueError, TypeError, KeyError, cv2.error: one of the two files cannot be read.
-    """
-    facts = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
-    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if stored is None or stored.dtype != np.uint16:
-        raise ValueError("it is no 16-bit picture")
-    if facts["content"] == "depth":
-        values = facts["offset"] + facts["scale"] * stored.astype(np.float64)
-        return True, np.where(stored == NO_DEPTH, np.inf, values)
-    normals = stored[..., ::-1].astype(np.float64) / FULL * 2 - 1
-    return False, np.where((stored != 0).any(-1, keepdims=True), normals, 0.0)
-
-
-def decode_exr(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
-    """Decode an EXR; the result is as for decode_png.
-
-    Raises:
-        CaptureError: it cannot be read.
-        KeyError: it lacks a channel.
-    """
-    channels = read_exr(path)
-    if "Z" in channels:
-        return True, np.where(channels["A"] > 0, channels["Z"], np.inf)
-    return False, np.stack([channels[f"N.{axis}"] for axis in "XYZ"], -1)
+def _contents(seen: Bool[np.ndarray, "height width"], said: str) -> Contents:
+    height, width = seen.shape
+    return Contents(pixels=(width, height), note=f"{said}; {int(seen.sum()):,} pixels show the object")
 
 
 def _normals(run: StoredRun) -> Float[np.ndarray, "height width 3"]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -11,16 +11,14 @@ from jaxtyping import Float
 
 from calibration.calibration import Calibration
 from calibration.light import Light, irradiance
-from capture.decode.exr import exr_size, write_exr
+from capture.decode.exr import write_exr
 from capture.decode.panorama import read_panorama
 from capture.errors import ReconstructionError
 from capture.files.title import file_stem
 from capture.photos.photo import encode_srgb
 from reconstruct.detail.fit import with_detail
-from reconstruct.export.export import Contents, ExportOptions, OnProgress, reading_back
-from reconstruct.export.film import checked_frames, checked_width, with_progress
-from reconstruct.export.film import read as read_film
-from reconstruct.export.video import write_film
+from reconstruct.export.export import Contents, OnProgress
+from reconstruct.export.film import checked_width, film
 from reconstruct.render.environment import sky_map
 from reconstruct.render.g_buffer import RenderView, look
 from reconstruct.render.relight import environment, relight_soft
@@ -74,41 +72,29 @@ def relit_file(run_dir: Path, new: NewLight, out: Path | None) -> Path:
     return out
 
 
-def write_relit(run: StoredRun, path: Path, new: NewLight, width: int | None, on_progress: OnProgress) -> None:
+def write_relit(run: StoredRun, path: Path, new: NewLight, width: int | None, on_progress: OnProgress) -> Contents:
     """Write the picture (linear in .exr, sRGB without tone mapping in .png), or the video of a turn of the light.
 
     Raises:
         UserError: a file of the run or the map cannot be read, or the width is out of range.
     """
     camera = run.fields.camera
-    wide = checked_width(ExportOptions(width=width), camera.width)
+    wide = checked_width(width, camera.width)
     tall = max(1, round(camera.height * wide / camera.width))
     if new.orbit is not None:
         wide, tall = even(wide), even(tall)
     posed_camera = run.fields.posed_camera.resized(wide, tall)
     view = with_detail(look(run.fields, None, posed_camera), run.details, posed_camera.camera)
     if new.orbit is not None:
-        write_film(path, with_progress(_turning(run, view, new), checked_frames(new.orbit), on_progress))
-        return
+        return film(path, _turning(run, view, new), new.orbit, on_progress)
     on_progress(0, 1, "computing the picture")
     picture = _picture(run, view, new)
     if path.suffix.lower() == ".exr":
         write_exr(path, {name: picture[..., i] for i, name in enumerate("RGB")}, {"comments": "linear, ITU-R BT.709"})
-    elif not cv2.imwrite(str(path), np.ascontiguousarray(encode_srgb(picture)[..., ::-1]), PNG_LEVEL):
+        return Contents(pixels=(wide, tall), note="linear, 1 = white of the photos")
+    if not cv2.imwrite(str(path), np.ascontiguousarray(encode_srgb(picture)[..., ::-1]), PNG_LEVEL):
         raise ReconstructionError(f"{path.name} could not be written. Check the disk and try again.")
-
-
-def read(run: StoredRun, path: Path) -> Contents:
-    """Read back the contents of a relit picture or video.
-
-    Raises:
-        ReconstructionError: it cannot be read.
-    """
-    if path.suffix.lower() == ".exr":
-        with reading_back(path):
-            return Contents(pixels=exr_size(path), note="linear, 1 = white of the photos")
-    found = read_film(run, path)
-    return found if found.frames else replace(found, note="sRGB, as exposed as the photos")
+    return Contents(pixels=(wide, tall), note="sRGB, as exposed as the photos")
 
 
 def lamp_at(
@@ -160,9 +146,9 @@ def _turning(run: StoredRun, view: RenderView, new: NewLight) -> Iterator[Float[
     assert new.orbit is not None
     middle, calibration = studio_of(np.asarray(run.mesh.bounds)).centre, run.calibration
     used = [light for light in calibration.lights if light.used] or list(calibration.lights)
-    offsets = np.array([light.homogeneous()[:3] - light.homogeneous()[3] * middle for light in used])
-    elevation = float(np.median([direction_of(offset)[1] for offset in offsets]))
-    reach, first = float(np.median(np.linalg.norm(offsets, axis=1))), direction_of(offsets[0])[0]
+    ways, distances = zip(*(light.seen_from(middle) for light in used), strict=True)
+    elevation = float(np.median([direction_of(way)[1] for way in ways]))
+    reach, first = float(np.median(distances)), direction_of(ways[0])[0]
     w = used[0].homogeneous()[3]
     for k in range(new.orbit):
         way = reach * towards(first + 2 * math.pi * k / new.orbit, elevation)

@@ -1,22 +1,20 @@
 """The mesh for display: reduced and textured, as GLB, OBJ with its pictures, or USDZ.
 
-Writers raise ReconstructionError if the mesh cannot be read or reduced, OSError if a file cannot be written.
+Writers raise ReconstructionError if the mesh cannot be read or reduced, or has holes although nothing was cut away;
+OSError if a file cannot be written.
 """
 
-import io
 from pathlib import Path
 
 import numpy as np
-import trimesh
-from jaxtyping import Float, Integer, UInt8
+from jaxtyping import Float
 from PIL import Image
 
 from capture.errors import ReconstructionError
-from reconstruct.export.edited import edit_of, edited_surface, edits_in_words
-from reconstruct.export.export import Contents, ExportOptions, OnProgress, reading_back
+from reconstruct.export.edited import edited_surface
+from reconstruct.export.export import Contents, ExportOptions, OnProgress
 from reconstruct.mesh.glb import write_textured_glb
 from reconstruct.mesh.mesh import MM_PER_METRE
-from reconstruct.mesh.simplify import bounds_a_solid
 from reconstruct.mesh.texture import TexturedMesh, bake, size_for
 from reconstruct.stored_run.stored_run import StoredRun
 
@@ -29,27 +27,30 @@ TEXTURE_STEP = 256  # px
 STEPS = 3
 
 
-def glb(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def glb(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> Contents:
     """Write GLB: metres, y up, standing on the origin, base colour, normal map, metallic and roughness factors."""
-    baked = _baked(run, options, on_progress)
-    attributes = {
-        "POSITION": _to_metres(run.unit) * standing(baked.vertices) @ Y_UP.T,
-        "NORMAL": baked.normals @ Y_UP.T,
-        "TANGENT": np.column_stack([baked.tangents[:, :3] @ Y_UP.T, baked.tangents[:, 3]]),
-        "TEXCOORD_0": baked.uv,
-    }
-    pictures = (_png(baked.base), _png(baked.normal_map))
-    path.write_bytes(write_textured_glb(attributes, baked.faces, pictures, baked.metallic, baked.roughness))
+    baked, contents = _baked(run, path, options, on_progress)
+    content = write_textured_glb(
+        _to_metres(run.unit) * standing(baked.vertices) @ Y_UP.T,
+        baked.normals @ Y_UP.T,
+        np.column_stack([baked.tangents[:, :3] @ Y_UP.T, baked.tangents[:, 3]]),
+        baked.uv,
+        baked.faces,
+        (baked.base, baked.normal_map),
+        (baked.metallic, baked.roughness),
+    )
+    path.write_bytes(content)
+    return contents
 
 
-def obj(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def obj(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> Contents:
     """Write OBJ with MTL and two PNG files beside it: the run's unit, y up, as most programs expect."""
-    baked = _baked(run, options, on_progress)
+    baked, contents = _baked(run, path, options, on_progress, "millimetres")
     stem = path.stem.replace(" ", "_")  # programs disagree about spaces in these names
     material = path.with_name(f"{stem}.mtl")
     pictures = {"map_Kd": path.with_name(f"{stem}_colour.png"), "norm": path.with_name(f"{stem}_normals.png")}
     for picture, file in zip((baked.base, baked.normal_map), pictures.values(), strict=True):
-        file.write_bytes(_png(picture))
+        Image.fromarray(picture).save(file)
     lines = ["newmtl object", "Kd 1 1 1", "Ks 0 0 0", f"Pm {baked.metallic:.4f}", f"Pr {baked.roughness:.4f}"]
     lines += [f"{key} {file.name}" for key, file in pictures.items()]
     material.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -61,9 +62,10 @@ def obj(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgr
         np.savetxt(file, np.column_stack([baked.uv[:, 0], 1 - baked.uv[:, 1]]), "vt %.6f %.6f")  # v up
         np.savetxt(file, normals, "vn %.5f %.5f %.5f")
         np.savetxt(file, np.repeat(baked.faces + 1, 3, 1), "f %d/%d/%d %d/%d/%d %d/%d/%d")
+    return contents
 
 
-def usdz(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def usdz(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> Contents:
     """Write USDZ: metres, y up, standing on the origin, UsdPreviewSurface. Needs the extra `usd`.
 
     Raises:
@@ -76,16 +78,17 @@ def usdz(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProg
             "USDZ needs the package usd-core, which is not installed: pip install 'shadowgraph[usd]'. "
             "GLB needs nothing more, and holds the same."
         ) from error
-    baked = _baked(run, options, on_progress)
+    baked, contents = _baked(run, path, options, on_progress)
     write_usdz(
         path,
         _to_metres(run.unit) * standing(baked.vertices) @ Y_UP.T,
         baked.normals @ Y_UP.T,
         baked.uv,
         baked.faces,
-        (_png(baked.base), _png(baked.normal_map)),
+        (baked.base, baked.normal_map),
         (baked.metallic, baked.roughness),
     )
+    return contents
 
 
 def standing(vertices: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -94,55 +97,10 @@ def standing(vertices: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return vertices - np.append(0.5 * (low + high)[:2], low[2])
 
 
-def read(run: StoredRun, path: Path) -> Contents:
-    """Read back the contents of a textured mesh.
-
-    Raises:
-        ReconstructionError: it or its pictures cannot be read, or it does not bound a solid.
-    """
-    with reading_back(path):
-        if path.suffix.lower() == ".usdz":
-            from reconstruct.mesh.usd import read_usdz as read_file
-        else:
-            read_file = _read_mesh
-        vertices, faces, size = read_file(path)
-    if not bounds_a_solid(vertices, faces) and not edit_of(run).cuts_guess:
-        raise ReconstructionError(
-            f"{path.name} reads back as {len(faces)} triangles that leave holes, and a closed surface was needed. "
-            "Export again with another number of faces."
-        )
-    in_metres = path.suffix.lower() != ".obj"
-    extents = np.ptp(vertices, axis=0)[[0, 2, 1]] / (_to_metres(run.unit) if in_metres else 1.0)
-    unit = "metres" if in_metres else "millimetres"
-    note = f"{unit if run.unit == 'mm' else 'units of the scene'}, y up, pictures of {size} x {size} pixels"
-    x, y, z = (float(e) for e in extents)
-    return Contents(len(faces), (x, y, z), note=f"{_closure(vertices, faces)}, {note}{edits_in_words(run)}")
-
-
-def _closure(vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray, "m 3"]) -> str:
-    """State whether the file's triangles are joined into a closed surface, or only lie against each other."""
-    sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
-    _, uses = np.unique(sides, axis=0, return_counts=True)
-    if (uses == 2).all():
-        return "closed"
-    if not bounds_a_solid(vertices, faces):
-        return "not closed"
-    return "without gaps, but cut along the seams of its pictures (to print it, export 3MF or STL)"
-
-
-def _read_mesh(path: Path) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, int]:
-    """Return vertices, faces and the size of the base colour's picture of a GLB or OBJ."""
-    mesh = trimesh.load_mesh(path, process=False)
-    assert isinstance(mesh, trimesh.Trimesh)
-    material = getattr(mesh.visual, "material", None)
-    picture = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    if picture is None:
-        raise ValueError("it has no picture")
-    picture.load()
-    return np.asarray(mesh.vertices), np.asarray(mesh.faces), picture.width
-
-
-def _baked(run: StoredRun, options: ExportOptions, on_progress: OnProgress) -> TexturedMesh:
+def _baked(
+    run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress, unit: str = "metres"
+) -> tuple[TexturedMesh, Contents]:
+    """Return the textured mesh, and what a file of it holds whose lengths are in `unit`."""
     low, high = TEXTURE_SIZES
     if options.texture is not None and not low <= options.texture <= high:
         raise ReconstructionError(f"pictures of {options.texture} px were asked for; {low} to {high} px can be made.")
@@ -153,7 +111,11 @@ def _baked(run: StoredRun, options: ExportOptions, on_progress: OnProgress) -> T
     on_progress(1, STEPS, f"unwrapping it and baking colour and normals, {size} x {size} pixels")
     baked = bake(surface.fields, small, surface.mesh, size, surface.details)
     on_progress(2, STEPS, "writing it")
-    return baked
+    joins = "without gaps, but cut along the seams of its pictures (to print it, export 3MF or STL)"
+    how = joins if surface.is_closed(path, baked.vertices, baked.faces) else "not closed"
+    note = f"{how}, {unit if run.unit == 'mm' else 'units of the scene'}, y up, pictures of {size} x {size} pixels"
+    x, y, z = map(float, np.ptp(baked.vertices, axis=0))
+    return baked, Contents(len(baked.faces), (x, y, z), run.unit, note=note + surface.edits_in_words())
 
 
 def _size_for(run: StoredRun) -> int:
@@ -166,9 +128,3 @@ def _size_for(run: StoredRun) -> int:
 
 def _to_metres(unit: str) -> float:
     return 1 / MM_PER_METRE if unit == "mm" else 1.0
-
-
-def _png(picture: UInt8[np.ndarray, "height width 3"]) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(picture).save(file, format="PNG")
-    return file.getvalue()

@@ -142,7 +142,7 @@ class Observer:
     def fields(self, surface: SdfGrid, scene: Scene) -> SolvedScene:
         """Return the solved scene: the surface, the material estimated on it, and the current lights.
 
-        All in the scene's world, and so is the surface of another lie.
+        All in the scene's world, and so is the surface of another object pose.
         """
         surface = self.in_world(surface)
         if self._ground is None:

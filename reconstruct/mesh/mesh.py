@@ -224,7 +224,7 @@ def mesh_material(fields: SolvedScene, mesh: trimesh.Trimesh) -> MetalRough | No
 def save_mesh(
     mesh: trimesh.Trimesh, path_ply: Path, path_glb: Path, unit: str, material: MetalRough | None = None
 ) -> None:
-    """Write a PLY and a GLB file atomically, and read both back to check them.
+    """Write a PLY and a GLB file atomically.
 
     PLY: world frame and unit, normals, sRGB colours, `evidence` and `sigma` if known. GLB: metres (scene units are not
     converted), y up, linear colours, one metallic-roughness material.
@@ -234,7 +234,7 @@ def save_mesh(
         material: of the GLB; by default rough and not metallic, in the mesh's colours.
 
     Raises:
-        ReconstructionError: the mesh is empty, or a file does not read back as written.
+        ReconstructionError: the mesh is empty.
         OSError: a file cannot be written.
     """
     if not len(mesh.faces):
@@ -243,7 +243,6 @@ def save_mesh(
         )
     with atomic_file(path_ply) as temporary:
         mesh.export(temporary, file_type="ply", vertex_normal=True)
-        _check(temporary, path_ply.name, len(mesh.faces), mesh.extents)
     scale = 1 / MM_PER_METRE if unit == "mm" else 1.0
     y_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     if material is None:
@@ -253,14 +252,3 @@ def save_mesh(
         vertices = scale * mesh.vertices @ y_up.T
         normals = mesh.vertex_normals @ y_up.T
         temporary.write_bytes(write_glb(vertices, normals, material.base.numpy(), mesh.faces, *gloss))
-        _check(temporary, path_glb.name, len(mesh.faces), np.ptp(vertices, axis=0))
-
-
-def _check(path: Path, name: str, faces: int, extents: Float[np.ndarray, "3"]) -> None:
-    """Raise unless the file has the given number of triangles and extents (to float32)."""
-    found = trimesh.load_mesh(path, process=False)
-    if len(found.faces) != faces or not np.allclose(found.extents, extents, rtol=1e-4):
-        raise ReconstructionError(
-            f"{name} reads back with {len(found.faces)} triangles and extents {found.extents}, "
-            f"{faces} and {extents} were written. Check the disk and export again."
-        )

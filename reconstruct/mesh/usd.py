@@ -3,13 +3,11 @@
 # It brings no type stubs.
 # pyright: reportAttributeAccessIssue=false
 
-import io
 import tempfile
-import zipfile
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Integer
+from jaxtyping import Float, Integer, UInt8
 from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
@@ -22,7 +20,7 @@ def write_usdz(
     normals: Float[np.ndarray, "n 3"],
     uv: Float[np.ndarray, "n 2"],
     faces: Integer[np.ndarray, "m 3"],
-    pictures: tuple[bytes, bytes],
+    pictures: tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width 3"]],
     metal_rough: tuple[float, float],
 ) -> None:
     """Write a package with one mesh and a UsdPreviewSurface.
@@ -30,7 +28,7 @@ def write_usdz(
     Args:
         vertices: metres, y up.
         uv: v down.
-        pictures: PNG files: base colour, sRGB; and normals in tangent space.
+        pictures: base colour, sRGB; and normals in tangent space.
         metal_rough: metallic and roughness of the whole mesh.
 
     Raises:
@@ -38,8 +36,8 @@ def write_usdz(
     """
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        (place / COLOUR).write_bytes(pictures[0])
-        (place / NORMALS).write_bytes(pictures[1])
+        for name, picture in zip((COLOUR, NORMALS), pictures, strict=True):
+            Image.fromarray(picture).save(place / name)
         stage = Usd.Stage.CreateNew(str(place / "object.usdc"))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -92,22 +90,3 @@ def _material(stage: Usd.Stage, metallic: float, roughness: float) -> UsdShade.M
         surface.CreateInput(name, kind).ConnectToSource(texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
     material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
     return material
-
-
-def read_usdz(path: Path) -> tuple[Float[np.ndarray, "n 3"], Integer[np.ndarray, "m 3"], int]:
-    """Return vertices, faces and the width of the colour picture of a package written here.
-
-    Raises:
-        ValueError, OSError, zipfile.BadZipFile: it is not one.
-    """
-    with zipfile.ZipFile(path) as package:
-        names = [name for name in package.namelist() if name.endswith(COLOUR)]
-        if not names:
-            raise ValueError("it has no picture")
-        with Image.open(io.BytesIO(package.read(names[0]))) as picture:
-            width = picture.width
-    stage = Usd.Stage.Open(str(path))
-    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/Object/Mesh"))
-    vertices = np.asarray(mesh.GetPointsAttr().Get(), np.float64)
-    faces = np.asarray(mesh.GetFaceVertexIndicesAttr().Get(), np.int64).reshape(-1, 3)
-    return vertices, faces, width

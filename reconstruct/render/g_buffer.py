@@ -215,7 +215,7 @@ def _seen_by_one(fields: SolvedScene) -> SeenMaterial:
     ground = np.asarray(binary_erosion(finite & ~mask, square, border_value=1), bool)
     trusted = trusted if trusted.any() else mask
     points = maps.points.numpy()
-    if fields.object_from_world is not None:  # of another lie: its ground is not that of the scene
+    if fields.object_from_world is not None:  # of another object pose: its ground is not that of the scene
         points = fields.in_common(points.reshape(-1, 3).astype(float)).reshape(points.shape).astype(np.float32)
         ground = np.zeros_like(ground)
     return SeenMaterial(points[trusted], albedo[trusted], gloss[trusted], points[ground], albedo[ground], fields)

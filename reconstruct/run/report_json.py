@@ -96,7 +96,7 @@ def _photos(calibration: Calibration, view: str, is_solved: bool) -> list[dict[s
     """Return a view's photos with their role, and whether they were used.
 
     Args:
-        is_solved: False for a view of a lie that could not be laid on the others.
+        is_solved: False for a view of an object pose that could not be laid on the others.
     """
     residuals = plain(calibration.residuals)
     lights = [{"name": x.photo, "role": "lit", "used": x.used, "reason": x.reason} for x in calibration.lights]
@@ -121,7 +121,7 @@ def _said(calibrated: CalibratedViews, key: str) -> list[str]:
 
 
 def _of_views(calibrated: CalibratedViews, solved: SolvedScene) -> dict[str, Any]:
-    """Return the rows of the single views, where there are several; of another lie, with how it lies in the first."""
+    """Return the rows of the single views, where there are several; of another object pose with its motion."""
     every = calibrated.every()
     if len(every) == 1:
         return {}

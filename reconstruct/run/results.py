@@ -56,7 +56,7 @@ def write_detail(
         CaptureError: a photo can no longer be read.
     """
     sources = {own.name: own for own in source.views()}
-    seen = [own for lie in (calibrated, *calibrated.lies) for own in seen_views(photos, lie)]
+    seen = [own for one in (calibrated, *calibrated.object_poses) for own in seen_views(photos, one)]
     by_name = {own[0].view: own for own in seen}
     views, details = fields.views(), []
     for number, view in enumerate(views):
@@ -114,14 +114,14 @@ def save_results(mesh: trimesh.Trimesh, fields: SolvedScene, calibrated: Calibra
     """Write mesh.ply, mesh.glb, depth.npy, normal.npy and mask.png, each whole or absent; see CONVENTIONS.md.
 
     The maps are those of the first view's camera: depth along its z axis, normals in the world frame. Where there are
-    several views, the maps of each follow in a folder of its name. Those of another lie belong to that lie's
+    several views, the maps of each follow in a folder of its name. Those of another object pose belong to that pose's
     calibration: normals in its world, the maps cut at its ground.
 
     Args:
         mesh: of extract_mesh(fields).
 
     Raises:
-        ReconstructionError: the mesh is empty, or a file does not read back.
+        ReconstructionError: the mesh is empty.
         OSError: no room, or no right to write there.
     """
     folder.mkdir(parents=True, exist_ok=True)

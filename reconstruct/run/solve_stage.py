@@ -17,8 +17,8 @@ from reconstruct.config import FitConfig
 from reconstruct.fields import SolvedScene
 from reconstruct.mesh.mesh import preview_mesh
 from reconstruct.mesh.texture import PhotoColours
-from reconstruct.run.lies_stage import forget_lies, joined_lies
 from reconstruct.run.machine import within_budget, work_of
+from reconstruct.run.object_poses_stage import forget_object_poses, joined_object_poses
 from reconstruct.run.presets import config_from_json, continued, solver_config, training
 from reconstruct.run_folder.folder import KEPT, RunFolder
 from reconstruct.run_folder.once import Lazy
@@ -158,8 +158,8 @@ def solve(
             steering = RequestSteering(run)
             solved = train(scenes[0], config, report, checkpoint, device, steering)
         else:
-            lies = [(lie.name, prepare_scene(source, read, lie, chosen)) for lie in calibrated.lies]
-            scenes, start, doubts = joined_lies(scenes, tuple(lies), config, run, report, device)
+            object_poses = [(one.name, prepare_scene(source, read, one, chosen)) for one in calibrated.object_poses]
+            scenes, start, doubts = joined_object_poses(scenes, tuple(object_poses), config, run, report, device)
             steering = RequestSteering(run, config, continued)
             earlier = load_state(run.file(EARLIER), json.dumps(asdict(config))) or start
             solved = fit_steered(scenes, config, report, checkpoint, device, steering, earlier, run.activity)
@@ -170,7 +170,7 @@ def solve(
     if steering.was_stopped:
         run.leave_open()
     else:
-        forget_lies(run)
+        forget_object_poses(run)
     run.reopen("mesh", "detail")  # of a surface that was stopped earlier
     return replace(solved, doubts=(*solved.doubts, *doubts))
 

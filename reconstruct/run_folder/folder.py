@@ -26,7 +26,7 @@ LOG = "log.jsonl"
 LARGEST_LOG = 256 << 20  # bytes; a run of a day writes a hundredth of it
 KEPT = "kept_photos"  # folder of reduced photos, while the run needs them
 PLAN = "memory.json"  # photos and pixels that the run uses so that it fits into memory
-MOST_PARTS = 5  # of a photo's path in a capture: its folder, lie, view, role, name
+MOST_PARTS = 5  # of a photo's path in a capture: its folder, object pose, view, role, name
 HASH_BLOCK = 1 << 20  # bytes read at once while hashing: large enough that Python's loop does not show
 
 

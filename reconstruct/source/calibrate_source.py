@@ -98,7 +98,7 @@ def calibrate_source(source: Source, photos: Sequence[Photos], options: RunOptio
     def all_finished(some: CalibratedViews) -> CalibratedViews:
         return some.with_calibrations([finished(view.calibration) for view in some.views])
 
-    return replace(all_finished(views), lies=tuple(map(all_finished, views.lies)))
+    return replace(all_finished(views), object_poses=tuple(map(all_finished, views.object_poses)))
 
 
 def with_light_error(calibration: Calibration, relative: float) -> Calibration:
@@ -111,8 +111,8 @@ def with_light_error(calibration: Calibration, relative: float) -> Calibration:
         return calibration
     middle, lights = calibration.posed_camera.looked_at(), []
     for light in calibration.lights:
-        distance = 1.0 if light.position is None else float(np.linalg.norm(light.position - middle))
-        lights.append(replace(light, sigma=np.maximum(light.sigma, relative * distance / np.sqrt(3))))
+        least = relative * light.seen_from(middle)[1] / np.sqrt(3)
+        lights.append(replace(light, sigma=np.maximum(light.sigma, least)))
     return replace(calibration, lights=tuple(lights))
 
 

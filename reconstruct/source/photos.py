@@ -16,7 +16,6 @@ from jaxtyping import Float
 
 from calibration.calibration import Calibration
 from calibration.known_scene import KnownScene
-from calibration.light import Light
 from calibration.scenes.ground_depth import read_ground_depth
 from capture.checks.check_stack import check_and_register, register, white_balance_finding
 from capture.decode.formats import read_size
@@ -123,7 +122,8 @@ def keep_spread(calibration: Calibration, count: int) -> Calibration:
     lights = [replace(x, used=True, reason="") if x.reason == TOO_MANY else x for x in calibration.lights]
     names = list(dict.fromkeys(light.photo for light in lights if light.used))
     if len(names) > count:
-        towards = np.array([_direction(next(x for x in lights if x.photo == name), calibration) for name in names])
+        middle, first = calibration.posed_camera.looked_at(), {x.photo: x for x in reversed(lights)}
+        towards = np.array([first[name].seen_from(middle)[0] for name in names])
         chosen, nearest = [0], np.full(len(names), np.inf)
         while len(chosen) < count:
             nearest = np.minimum(nearest, 1 - towards @ towards[chosen[-1]])
@@ -131,14 +131,6 @@ def keep_spread(calibration: Calibration, count: int) -> Calibration:
         kept = {names[i] for i in chosen}
         lights = [replace(x, used=False, reason=TOO_MANY) if x.used and x.photo not in kept else x for x in lights]
     return replace(calibration, lights=tuple(lights))
-
-
-def _direction(light: Light, calibration: Calibration) -> np.ndarray:
-    """Return the unit vector towards a light, world."""
-    if light.position is None:
-        return np.asarray(light.direction)
-    away = light.position - calibration.posed_camera.looked_at()
-    return away / np.linalg.norm(away)
 
 
 @dataclass(frozen=True)

@@ -116,7 +116,7 @@ class Source:
         return "" if self.capture is None else self.capture.name
 
     def views(self) -> tuple["Source", ...]:
-        """Return a source for each session of a capture, those of its lies last; a scene is one view."""
+        """Return a source for each session of a capture, those of further object poses last; a scene is one view."""
         if self.capture is None:
             return (self,)
         return tuple(replace(self, capture=Capture(x.folder, (x,), name=x.name)) for x in self.capture.sessions())
@@ -129,7 +129,7 @@ class Source:
     def _own_files(self) -> list[Path]:
         if self.capture is not None:
             found: list[Path] = []
-            captures = (self.capture, *self.capture.lies)
+            captures = (self.capture, *self.capture.object_poses)
             for folder in dict.fromkeys((self.folder, *(one.folder for one in captures))):
                 found += [folder / SETTINGS_FILE] if (folder / SETTINGS_FILE).is_file() else []
             for session in self.capture.sessions():

@@ -8,7 +8,6 @@ import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from calibration.calibrated_views import CalibratedView
-from capture.files.atomic import parse_json
 from capture.files.schema import FileName, NotNegative, Number, Text, Vector, as_type, check_numbers, read_as
 
 REPORT, MANIFEST, CHECK = "report.json", "manifest.json", "check.json"
@@ -17,9 +16,6 @@ MOST_STAGES, MOST_VERSIONS = 64, 256
 MOST_PHOTOS = 10_000
 LONGEST_LINE = 1 << 16  # bytes of a line of the log
 MOST_LINES = 200_000  # of the log that are read
-NOTHING_SAID = {"t": 0.0, "cpu_s": 0.0, "done": 0.0, "total": 0.0, "eta_s": None, "stage": "", "message": ""} | {
-    "numbers": {}
-}  # what stands for what a line of the log lacks
 RUN_AGAIN = "Run again, or ask for the file again."
 Angle = Annotated[float, Meta(ge=-360, le=360, description="an angle in degrees")]
 Scalar = Text | Number | bool | None  # what is shown as it stands
@@ -95,13 +91,13 @@ class _Manifest(Struct):
 
 
 class _Line(Struct):
-    """Of a line of log.jsonl, what is read."""
+    """A line of log.jsonl."""
 
     t: Number = 0.0
     cpu_s: Number = 0.0
     done: Number = 0.0
     total: Number = 0.0
-    eta_s: Number = 0.0
+    eta_s: Number | None = None
     stage: str = ""
     message: str = ""
     numbers: dict[str, Number] = {}
@@ -183,12 +179,9 @@ def log_lines(content: bytes) -> list[dict[str, Any]]:
     lines = []
     for line in content.splitlines()[-MOST_LINES:]:
         try:
-            found = parse_json(line.decode("utf-8", errors="replace")) if len(line) <= LONGEST_LINE else None
-            known = {key: value for key, value in msgspec.convert(found, dict).items() if value is not None}
-            msgspec.convert(known, _Line)
+            lines.append(msgspec.to_builtins(msgspec.json.decode(line[:LONGEST_LINE], type=_Line)))
         except ValueError:
             continue  # the last line of a killed run
-        lines.append(NOTHING_SAID | known)
     return lines
 
 

@@ -1,18 +1,17 @@
 """Read the maps and pictures of a run: depth.npy, normal.npy, mask.png, thumbs/*.jpg."""
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
-from numpy.lib import format as npy
 
 from capture.decode.formats import LARGEST_WHOLE
 from capture.decode.small_picture import read_small_picture
 from capture.errors import CaptureError, ReconstructionError
-from capture.files.regular import is_own_folder, is_regular, open_regular
+from capture.files.arrays import parse_npy
+from capture.files.regular import is_own_folder, is_regular, read_regular
 from reconstruct.stored_run.refusal import refusal
 
 DEPTH, NORMALS, MASK, THUMBS = "depth.npy", "normal.npy", "mask.png", "thumbs"
@@ -22,7 +21,6 @@ MOST_PIXELS = 1 << 27  # of all thumbnails that are held at a time: 400 MB
 NORMAL_ATOL = 1e-3  # of a normal's length, which is 1 or 0
 LARGEST_DEPTH = 1e12  # world length
 BRIGHT = 127  # above this a pixel of a mask is inside
-KINDS = ("<f4", "<f8")
 
 
 @dataclass(frozen=True)
@@ -132,23 +130,15 @@ def read_thumbnails(folder: Path, photos: Iterable[str]) -> dict[str, UInt8[np.n
 
 
 def _numbers(path: Path, channels: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
-    """Read pixels of so many channels from a .npy file of floats. Nothing in it is unpickled."""
+    """Read pixels of so many channels from a .npy file of floats."""
     try:
-        with open_regular(path, LARGEST_FILE) as file:
-            version = npy.read_magic(file)
-            if version != (1, 0):
-                raise ValueError(f"version {version} of the format")
-            shape, is_by_column, kind = npy.read_array_header_1_0(file)
-            if kind.str not in KINDS or is_by_column or len(shape) != 2 + len(channels) or shape[2:] != channels:
-                raise ValueError(f"{kind} numbers of shape {shape} were found, pixels of floats were needed")
-            start, count = file.tell(), math.prod(shape)
-            if min(shape) < 1 or shape[0] * shape[1] > LARGEST_WHOLE:
-                raise ValueError(f"{shape[:2]} pixels were found, at most {LARGEST_WHOLE:,} were needed")
-            size = file.seek(0, 2)
-            if size != start + count * kind.itemsize:
-                raise ValueError(f"its header states {start + count * kind.itemsize} bytes, {size} were found")
-            file.seek(start)
-            with np.errstate(over="ignore"):
-                return np.fromfile(file, kind, count).reshape(shape).astype(np.float32, copy=False)
-    except Exception as error:  # a header is Python text: what parses it raises many kinds
+        values = parse_npy(read_regular(path, LARGEST_FILE))
+    except Exception as error:
         raise refusal(path, error) from error
+    shape = values.shape
+    if values.dtype.kind != "f" or len(shape) != 2 + len(channels) or shape[2:] != channels or not values.size:
+        raise refusal(path, f"{values.dtype} numbers of shape {shape} were found, pixels of floats were needed")
+    if shape[0] * shape[1] > LARGEST_WHOLE:
+        raise refusal(path, f"{shape[:2]} pixels were found, at most {LARGEST_WHOLE:,} were needed")
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)

@@ -77,7 +77,7 @@ class StoredRun:
     def views(self) -> "tuple[tuple[str, Calibration, SolvedScene], ...]":
         """Each camera of the solve: the name of its view, its calibration, and the scene as it saw it.
 
-        Those of another lie are in that lie's world; SolvedScene.object_from_world leads to that of the others.
+        Those of another object pose are in that pose's world; SolvedScene.object_from_world leads to the others'.
         """
         first = self.calibration
         stored = {view.name: view.calibration for view in load_views(self.run_dir / CALIBRATION).every()}

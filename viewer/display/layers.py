@@ -241,7 +241,7 @@ def page_mesh(path: Path, mark: tuple[int, int] = (0, 0)) -> Triangles:
     """
     found = read_triangles(path)
     if len(found.faces) <= MOST_FACES:
-        return found  # without trimesh: beside a run its imports would be felt
+        return found  # without torch: beside a run its import would be felt
     from reconstruct.mesh.mesh import vertex_colours
     from reconstruct.mesh.simplify import simplified
 

@@ -2,8 +2,9 @@
 
 The cameras of a run and the photos that they took, each with its light, as the page's scripts read them.
 
-All are in the frame of the surface: what a camera saw of another lie is carried there with its lights, so that the page
-knows one object that does not move. The first camera is that of the run's pictures; the others show their photos.
+All are in the frame of the surface: what a camera saw in another object pose is carried there with its lights, so that
+the page knows one object that does not move. The first camera is that of the run's pictures; the others show their
+photos.
 """
 
 from collections.abc import Mapping

@@ -3,8 +3,6 @@
 Its parts are packed in stage.zip, which `shadowgraph run` leaves; a run without one is packed when its page is made.
 """
 
-import base64
-import gzip
 import html
 import json
 import re
@@ -41,9 +39,7 @@ SCRIPTS = (
 )
 SHADERS = ("surface.vert", "surface.frag", "depth.frag", "full.vert", "light.frag", "blur.frag", "show.frag")
 SHADERS += ("lines.vert", "lines.frag")
-READ_ERRORS = (OSError, ValueError, LookupError, TypeError, EOFError)
 IMPORTED, EXPORTED = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL), re.compile(r"^export ", re.MULTILINE)
-SCENE = re.compile(r'<script type="application/json" id="scene">(.*?)</script>', re.DOTALL)
 PAGE = Format(
     ".html",
     "A page to send to somebody",
@@ -108,16 +104,13 @@ def write_stage(run_dir: Path) -> None:
         temporary.write_bytes(content)
 
 
-def stage_page(run_dir: Path, on_progress: OnProgress = lambda done, total, message: None) -> str:
+def stage_page(run_dir: Path) -> str:
     """Return the page of a finished run with everything in it.
 
     Raises:
         UserError: the run is not finished, or a file of it cannot be used.
     """
-    on_progress(0, 2, "packing the scene")
-    pack = stage_pack(run_dir)
-    on_progress(1, 2, "writing the page")
-    return page_of(run_dir, pack)
+    return page_of(run_dir, stage_pack(run_dir))
 
 
 def page_of(run_dir: Path, pack: StagePack, saves: str = "", home: str = "") -> str:
@@ -195,28 +188,16 @@ def kind_of(part: str) -> str:
     return "image/jpeg" if part.endswith(".jpg") else "application/octet-stream"
 
 
-def write_page(run: StoredRun, path: Path, options: ExportOptions, progress: OnProgress) -> None:
+def write_page(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> Contents:
     """Write the page of a run: one file of a few megabytes."""
-    path.write_text(stage_page(run.run_dir, progress), encoding="utf-8")
-
-
-def read(run: StoredRun, path: Path) -> Contents:
-    """Read a page back and return what it holds.
-
-    Raises:
-        ReconstructionError: it is not what was to be written.
-    """
-    try:
-        found = SCENE.search(path.read_text(encoding="utf-8"))
-        if found is None:
-            raise ValueError("it holds no scene")
-        facts = json.loads(found.group(1))
-        gzip.decompress(base64.b64decode(facts["addresses"]["block"].partition(",")[2]))  # which checks its sum
-    except READ_ERRORS as error:
-        raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
+    on_progress(0, 2, "packing the scene")
+    pack = stage_pack(run.run_dir)
+    on_progress(1, 2, "writing the page")
+    path.write_text(page_of(run.run_dir, pack), encoding="utf-8")
+    facts = pack.facts
     x, y, z = (float(e) for e in np.ptp(np.asarray(facts["bounds"]), axis=0))
     note = f"{len(facts['lights'])} lights, {UNIT_WORDS[run.unit]}; open it in any browser"
-    return Contents(facts["parts"]["corners"]["count"] // 3, (x, y, z), note=note)
+    return Contents(facts["parts"]["corners"]["count"] // 3, (x, y, z), run.unit, note=note)
 
 
 def _json(value: Any) -> str:

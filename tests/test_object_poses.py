@@ -1,10 +1,11 @@
-"""An object laid on another side: how it was turned is found, and one surface comes from all of its lies."""
+"""An object laid on another side: how it was turned is found, and one surface comes from all of its poses."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from reconstruct.object_poses.noise import mean_difference
 from scipy.spatial.transform import Rotation
 from synthetic import Look, Sphere, default_camera, grid_of, render
 
@@ -15,11 +16,10 @@ from reconstruct.fields import FurtherView, SolvedScene, load_fields, save_field
 from reconstruct.labels.held_out import hold_out
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import placed_rays, supervise
-from reconstruct.lies import alignment
-from reconstruct.lies.alignment import SeenSurface, align, angle_between, stepped
-from reconstruct.lies.motion_refine import LieRays, compare, refined_motion
-from reconstruct.lies.noise import mean_difference
-from reconstruct.lies.together import SolvedLie, lay_together, merged_surface
+from reconstruct.object_poses import alignment
+from reconstruct.object_poses.alignment import SeenSurface, align, angle_between, stepped
+from reconstruct.object_poses.motion_refine import ObjectPoseRays, compare, refined_motion
+from reconstruct.object_poses.together import SolvedObjectPose, lay_together, merged_surface
 from reconstruct.render.g_buffer import seen_material
 from reconstruct.solve.light_refine import MovingLights, no_shift
 from reconstruct.views import placed
@@ -35,7 +35,7 @@ STILL = Pose(np.eye(3), np.zeros(3))
 
 
 def lying() -> tuple[tuple[Sphere, ...], Pose]:
-    """Return the shapes laid on another side, on the ground, and the motion back: object_from_lie."""
+    """Return the shapes laid on another side, on the ground, and the motion back: object_from_world."""
     centres = np.array([one.centre for one in SHAPES]) @ TURN.T
     drop = min(float(centre[2]) - one.radius for centre, one in zip(centres, SHAPES, strict=True))
     shift = np.array([*-centres[:, :2].mean(0), -drop])
@@ -90,7 +90,7 @@ def own_rays(laid):
     return supervise(laid[0], Observer(laid[0]).labels(surface, laid[0]))
 
 
-def test_how_an_object_was_turned_is_found_from_the_halves_that_either_lie_saw(monkeypatch):
+def test_how_an_object_was_turned_is_found_from_the_halves_that_either_object_pose_saw(monkeypatch):
     fewer(monkeypatch)
     shapes, motion = lying()
     found = align(seen_from(SHAPES, np.array([0.0, -0.6, 0.8])), seen_from(shapes, np.array([0.0, -0.6, 0.8])))
@@ -125,12 +125,12 @@ def test_another_object_is_refused_with_what_was_measured(monkeypatch):
         align(seen_from(SHAPES, np.array([0.0, 0.0, 1.0])), seen_from(other, np.array([0.0, 0.0, 1.0]), "turned_1"))
 
 
-def test_lies_of_an_object_of_a_few_voxels_are_named_and_the_first_is_kept():
+def test_object_poses_of_an_object_of_a_few_voxels_are_named_and_the_first_is_kept():
     small = (Sphere((0.0, 0.0, 4.0), 4.0, COLOUR),)
     scene, _ = render(small, Look(width=32, height=24, n_lights=2), default_camera(32, 24))
     albedo = torch.full((24, 32, 3), 0.5)
     fields = SolvedScene(grid_of(small, 2.5), albedo, scene.camera, scene.world_from_camera, 0.0, "mm")
-    found = lay_together((SolvedLie("", (scene,), fields), SolvedLie("turned_1", (scene,), fields)))
+    found = lay_together((SolvedObjectPose("", (scene,), fields), SolvedObjectPose("turned_1", (scene,), fields)))
     assert not found.placed and "voxels of the object are seen" in dict(found.refused)["turned_1"]
 
 
@@ -144,7 +144,7 @@ def test_a_placed_scene_meets_the_surface_as_the_scene_does_in_its_own_world(lai
     assert errors[0].mean() < 0.1 and np.abs(errors[0] - errors[1]).mean() < 0.02
 
 
-def test_lights_of_another_lie_move_in_its_own_world(laid):
+def test_lights_of_another_object_pose_move_in_its_own_world(laid):
     scene, motion = laid
     there = replace(scene, object_from_world=motion)
     own, moved = (MovingLights((one,), no_shift((one,))) for one in (scene, there))
@@ -158,7 +158,7 @@ def test_lights_of_another_lie_move_in_its_own_world(laid):
 
 def test_a_motion_a_little_off_is_refined_on_rays_and_held_out_rays_agree(laid, own_rays):
     scene, motion = laid
-    rays = LieRays((replace(scene, light_sigma=torch.full_like(scene.light_sigma, 0.5)),), (own_rays,))
+    rays = ObjectPoseRays((replace(scene, light_sigma=torch.full_like(scene.light_sigma, 0.5)),), (own_rays,))
     about, surface = np.array([5.0, 0.0, 30.0]), grid_of(SHAPES, 2.5)
     start = stepped(motion, np.array([0.05, -0.04, 0.05, 1.5, -1.2, 1.0]), about)
     found = refined_motion(start, surface, rays, about, 40.0)
@@ -175,7 +175,7 @@ def test_lights_that_are_all_too_high_pull_a_motion_less_where_they_may_be(laid,
     found = []
     for sigma in (0.0, 20.0):
         doubted = replace(high, light_sigma=torch.full_like(scene.light_sigma, sigma))
-        moved, lit = refined_motion(motion, surface, LieRays((doubted,), (own_rays,)), about, 40.0)
+        moved, lit = refined_motion(motion, surface, ObjectPoseRays((doubted,), (own_rays,)), about, 40.0)
         found.append((*off(moved, motion), lit.scenes[0].lights - high.lights))
     (turn, shift, still), (less_turn, less_shift, change) = found
     assert less_turn < 0.7 * turn and less_shift < 0.7 * shift
@@ -184,7 +184,7 @@ def test_lights_that_are_all_too_high_pull_a_motion_less_where_they_may_be(laid,
 
 def test_a_refined_motion_is_kept_where_a_guessed_part_of_the_surface_hides_what_it_gains(laid, own_rays):
     scene, motion = laid
-    rays, about = LieRays((scene,), (own_rays,)), np.array([5.0, 0.0, 30.0])
+    rays, about = ObjectPoseRays((scene,), (own_rays,)), np.array([5.0, 0.0, 30.0])
     start = stepped(motion, np.array([-0.01, 0.01, -0.01, -0.4, 0.3, -0.3]), about)
     guessed = grid_of((*SHAPES, Sphere((-22.0, 16.0, 20.0), 9.0, COLOUR)), 2.5)
     found = compare(guessed, (start, rays), (motion, rays))
@@ -205,7 +205,7 @@ def test_the_noise_of_a_difference_comes_from_groups_and_one_group_knows_none(gr
         assert (mean, noise) == (0.0, 0.0)
 
 
-def test_a_solved_scene_of_two_lies_equals_its_file_and_knows_both_worlds(laid, tmp_path):
+def test_a_solved_scene_of_two_object_poses_equals_its_file_and_knows_both_worlds(laid, tmp_path):
     scene, motion = laid
     first, _ = render(SHAPES, Look(width=64, height=48, n_lights=2), default_camera(64, 48))
     albedo = torch.full((48, 64, 3), 0.5)
@@ -228,7 +228,7 @@ def test_a_solved_scene_of_two_lies_equals_its_file_and_knows_both_worlds(laid, 
     assert float(view.grid.sdf(torch.tensor([lying()[0][1].centre], dtype=torch.float32)).item()) == pytest.approx(
         -14.0, abs=2.0
     )
-    points = seen_material(read).object_points  # those that the other lie's camera saw lie on the surface, too
+    points = seen_material(read).object_points  # those that the other pose's camera saw lie on the surface, too
     assert np.abs(read.grid.sdf(torch.from_numpy(points).float()).numpy()).mean() < 0.3
 
 
@@ -244,15 +244,15 @@ def test_merged_surfaces_are_cut_at_every_table():
     assert inside[:, 2].min() >= 0 and motion.inverse().apply(inside)[:, 2].min() >= 0
 
 
-def test_where_a_lie_saw_the_object_its_surface_counts_and_the_others_guess_does_not():
+def test_where_an_object_pose_saw_the_object_its_surface_counts_and_the_others_guess_does_not():
     ball = Sphere((0.0, 0.0, 40.0), 30.0, COLOUR)
-    lies = []
+    object_poses = []
     for side in (np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])):
         seen = seen_from((ball,), side)
         z = seen.grid.origin[2] + seen.grid.spacing * torch.arange(seen.grid.values.shape[2])
         swollen = seen.grid.values - 6 * (side[2] * (z - 40) < 0)  # mm: a guess that is far too thick
-        lies.append((replace(seen, grid=replace(seen.grid, values=swollen)), STILL))
-    merged = merged_surface(lies)
-    points = np.concatenate([lie.points for lie, _ in lies])
+        object_poses.append((replace(seen, grid=replace(seen.grid, values=swollen)), STILL))
+    merged = merged_surface(object_poses)
+    points = np.concatenate([object_pose.points for object_pose, _ in object_poses])
     points = points[np.abs(points[:, 2] - 40) > 12]
     assert float(merged.sdf(torch.from_numpy(points).float()).abs().max()) < 0.5  # mm

@@ -1,12 +1,12 @@
-"""Refine the motion between two lies on the rays of one of them: Gauss-Newton on what the solver's rays compare.
+"""Refine the motion between two object poses on the rays of one: Gauss-Newton on what the solver's rays compare.
 
-The surface stands still, and all cameras and lights of the lie move together: six numbers. Residuals are the
-differences between transmittance and label of the lie's shadow rays, and between opacity and mask of its camera rays,
-with weights that fall with the difference: a ray past a part that no lie saw is wrong under every motion.
+The surface stands still, and all cameras and lights of the pose move together: six numbers. Residuals are the
+differences between transmittance and label of the pose's shadow rays, and between opacity and mask of its camera rays,
+with weights that fall with the difference: a ray past a part that no pose saw is wrong under every motion.
 
 Six joint motions of each scene's lights are free besides: the one that changes no shadow where the object moves along
 [Kriegman and Belhumeur 2001], common shifts and stretches. A calibration that reads the ground's shading knows these
-worst, and shadow labels that are all too wide look like them. Held still, they would turn into a motion of the lie
+worst, and shadow labels that are all too wide look like them. Held still, they would turn into a motion of the pose
 towards the camera. They are unknowns of the refinement alone: the lights stay as calibrated.
 """
 
@@ -22,8 +22,7 @@ from calibration.pose import Pose
 from capture.checks.robust import cauchy, geman_mcclure
 from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out
 from reconstruct.labels.supervision import SURE_ENOUGH, Supervision
-from reconstruct.lies.alignment import stepped
-from reconstruct.lies.noise import mean_difference
+from reconstruct.object_poses.alignment import mean_difference, stepped
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import visibility
@@ -44,8 +43,8 @@ NUDGE = 0.05  # voxels at the object's edge, over the sharpness of 8: of the fin
 
 
 @dataclass(frozen=True)
-class LieRays:
-    """The supervised rays of a lie's scenes, in the lie's world."""
+class ObjectPoseRays:
+    """The supervised rays of a pose's scenes, in the pose's world."""
 
     scenes: Scenes
     rays: tuple[Supervision, ...]
@@ -70,20 +69,25 @@ class MotionTrial:
 
 
 def refined_motion(
-    start: Pose, surface: SdfGrid, lie: LieRays, about: Float[np.ndarray, "3"], radius: float, seed: int = 0
-) -> tuple[Pose, LieRays]:
-    """Return the motion, from a start near it, under which a lie's rays agree best with a surface.
+    start: Pose,
+    surface: SdfGrid,
+    object_pose: ObjectPoseRays,
+    about: Float[np.ndarray, "3"],
+    radius: float,
+    seed: int = 0,
+) -> tuple[Pose, ObjectPoseRays]:
+    """Return the motion, from a start near it, under which a pose's rays agree best with a surface.
 
     The rays are returned with it under the lights, moved together, under which they agree so.
 
     Args:
-        start: object_from_lie.
-        surface: of the other lies, in the object's frame: one that this lie has shaped would hold the motion back.
+        start: object_from_world.
+        surface: of the other poses, in the object's frame: one that this pose has shaped would hold the motion back.
         about: the object's centre there, and `radius` its size, world length: what a turn is measured with.
     """
-    samples = _samples(lie, seed, is_judging=False)
+    samples = _samples(object_pose, seed, is_judging=False)
     motion, middle = start, start.inverse().apply(about)
-    lights = [_JointMotions(scene, middle, np.zeros(MODES)) for scene in lie.scenes]
+    lights = [_JointMotions(scene, middle, np.zeros(MODES)) for scene in object_pose.scenes]
     for sharpness in SHARPNESS:
         shift = NUDGE * SHARPNESS[-1] / sharpness * surface.spacing
         steps = shift * np.array([1 / radius] * 3 + [1.0] * 3)
@@ -107,7 +111,7 @@ def refined_motion(
             motion = stepped(motion, steps * step[:6], about)
             changes = np.concatenate(nudges) * step[6:]
             lights = [own.changed(by) for own, by in zip(lights, changes.reshape(-1, MODES), strict=True)]
-    return motion, replace(lie, scenes=tuple(own.scene() for own in lights))
+    return motion, replace(object_pose, scenes=tuple(own.scene() for own in lights))
 
 
 def _least_squares(
@@ -128,15 +132,17 @@ def _least_squares(
     return -np.linalg.solve(normal, (slopes * weight[:, None]).T @ now + prior * at)
 
 
-def compare(surface: SdfGrid, before: tuple[Pose, LieRays], after: tuple[Pose, LieRays], seed: int = 0) -> MotionTrial:
-    """Judge two motions by rays that refined_motion did not use, on a surface to which this lie has not contributed.
+def compare(
+    surface: SdfGrid, before: tuple[Pose, ObjectPoseRays], after: tuple[Pose, ObjectPoseRays], seed: int = 0
+) -> MotionTrial:
+    """Judge two motions by rays that refined_motion did not use, on a surface to which this pose has not contributed.
 
     Args:
-        before, after: each motion with the same lie's rays, under the lights that go with it.
+        before, after: each motion with the same pose's rays, under the lights that go with it.
     """
     samples, errors = _samples(before[1], seed, is_judging=True), []  # the same rays under either lights
-    for motion, lie in (before, after):
-        pairs = zip(samples, lie.scenes, strict=True)
+    for motion, object_pose in (before, after):
+        pairs = zip(samples, object_pose.scenes, strict=True)
         off = np.concatenate([sample.residuals(surface, motion, SHARPNESS[-1], scene) for sample, scene in pairs])
         errors.append(1 - cauchy((off / WIDTH) ** 2))
     groups = np.concatenate([sample.groups(k) for k, sample in enumerate(samples)])
@@ -176,12 +182,12 @@ class _JointMotions:
         return lit_from(self.calibrated, LightShift(shift, np.zeros_like(shift)))
 
 
-def _samples(lie: LieRays, seed: int, is_judging: bool) -> "list[_Sample]":
+def _samples(object_pose: ObjectPoseRays, seed: int, is_judging: bool) -> "list[_Sample]":
     """Draw the rays of each scene that refine, or the others that judge: whole blocks of pixels."""
     found = []
-    for number, (scene, own) in enumerate(zip(lie.scenes, lie.rays, strict=True)):
+    for number, (scene, own) in enumerate(zip(object_pose.scenes, object_pose.rays, strict=True)):
         drawn = draw_blocks(own.pixels, scene.camera.width, 1, (seed, SEED + number), share=JUDGING)[0]
-        found.append(_Sample(scene, own, drawn == is_judging, seed, MOST_RAYS // len(lie.scenes)))
+        found.append(_Sample(scene, own, drawn == is_judging, seed, MOST_RAYS // len(object_pose.scenes)))
     return found
 
 

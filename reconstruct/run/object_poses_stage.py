@@ -1,4 +1,4 @@
-"""Part of stage "solve" for an object that was laid anew: each lie solved small on its own, then all laid together."""
+"""Part of stage "solve" for an object that was laid anew: each pose solved small on its own, then all laid together."""
 
 from dataclasses import dataclass, replace
 from itertools import count
@@ -8,9 +8,9 @@ import torch
 from capture.errors import ReconstructionError
 from reconstruct.config import FitConfig
 from reconstruct.fields import SolvedScene, load_fields, save_fields
-from reconstruct.lies.confirmed import confirmed, withheld
-from reconstruct.lies.together import PlacedLie, SolvedLie, Together, lay_together
 from reconstruct.mesh.mesh import extract_mesh
+from reconstruct.object_poses.confirmed import confirmed, withheld
+from reconstruct.object_poses.together import PlacedObjectPose, SolvedObjectPose, Together, lay_together
 from reconstruct.run.presets import preset
 from reconstruct.run_folder.folder import RunFolder
 from reconstruct.scene import reduced
@@ -20,66 +20,71 @@ from reconstruct.solve.solver import SolveReporter, begun, fit, fit_surface
 from reconstruct.source.source import LONG_SIDES
 from reconstruct.views import Scenes
 
-SMALL = "draft"  # preset of the lies' own solves: enough for how the object was turned
-KEPT_LIE = "checkpoint_lie"  # file of a lie's own solve, while the run needs it
-NOT_JOINED = "mesh.ply"  # of a lie that could not be laid on the others, in a folder of its name
+SMALL = "draft"  # preset of the poses' own solves: enough for how the object was turned
+KEPT_OBJECT_POSE = "checkpoint_object_pose"  # file of a pose's own solve, while the run needs it
+NOT_JOINED = "mesh.ply"  # of a pose that could not be laid on the others, in a folder of its name
 
-Lies = tuple[tuple[str, Scenes], ...]  # name and scenes of each further lie, in its own world
+ObjectPoses = tuple[tuple[str, Scenes], ...]  # name and scenes of each further pose, in its own world
 
 
-def joined_lies(
-    scenes: Scenes, lies: Lies, config: FitConfig, run: RunFolder, report: SolveReporter, device: torch.device | None
+def joined_object_poses(
+    scenes: Scenes,
+    object_poses: ObjectPoses,
+    config: FitConfig,
+    run: RunFolder,
+    report: SolveReporter,
+    device: torch.device | None,
 ) -> tuple[Scenes, SolveState | None, tuple[str, ...]]:
-    """Return the scenes of all lies that can be laid together, the state that their solve begins with, and doubts.
+    """Return the scenes of all poses that can be laid together, the state that their solve begins with, and doubts.
 
     Raises:
-        ReconstructionError: the first lie cannot be solved.
+        ReconstructionError: the first pose cannot be solved.
     """
-    if not (lies and scenes[0].ground_known):
+    if not (object_poses and scenes[0].ground_known):
         return scenes, None, ()
-    together = _SmallSolves(run, report, device, config.seed).laid_together(scenes, lies)
-    scenes, doubts = joined_scenes(scenes, lies, together.placed), tuple(text for _, text in together.refused)
+    together = _SmallSolves(run, report, device, config.seed).laid_together(scenes, object_poses)
+    scenes, doubts = joined_scenes(scenes, object_poses, together.placed), tuple(text for _, text in together.refused)
     start = begun(together.start, min(1, len(config.levels) - 1), scenes) if together.placed else None
     return scenes, start, doubts
 
 
-def joined_scenes(scenes: Scenes, lies: Lies, placed: tuple[PlacedLie, ...]) -> Scenes:
-    """Return the scenes of the first lie and of all that were placed, these with the motion to the first."""
+def joined_scenes(scenes: Scenes, object_poses: ObjectPoses, placed: tuple[PlacedObjectPose, ...]) -> Scenes:
+    """Return the scenes of the first pose and of all that were placed, these with the motion to the first."""
     motions = {one.name: one.motion for one in placed}
-    moved = [replace(s, object_from_world=motions[name]) for name, own in lies if name in motions for s in own]
+    moved = [replace(s, object_from_world=motions[name]) for name, own in object_poses if name in motions for s in own]
     return (*scenes, *moved)
 
 
-def forget_lies(run: RunFolder) -> None:
-    """Remove the files of the lies' own solves."""
-    for path in run.path.glob(f"{KEPT_LIE}_*"):
+def forget_object_poses(run: RunFolder) -> None:
+    """Remove the files of the poses' own solves."""
+    for path in run.path.glob(f"{KEPT_OBJECT_POSE}_*"):
         run.discard(path.name)
 
 
 @dataclass(frozen=True)
 class _SmallSolves:
-    """Small solves of lies, kept in the run folder, so that a run that was stopped does not repeat them."""
+    """Small solves of poses, kept in the run folder, so that a run that was stopped does not repeat them."""
 
     run: RunFolder
     report: SolveReporter
     device: torch.device | None
     seed: int
 
-    def laid_together(self, scenes: Scenes, lies: Lies) -> Together:
-        """Solve the first lie's scenes and each further lie's, and find how these lie in the world of the first.
+    def laid_together(self, scenes: Scenes, object_poses: ObjectPoses) -> Together:
+        """Solve the first pose's scenes and each further pose's, and find how these lie in the world of the first.
 
-        A lie that cannot be solved or placed is named in the result's `refused`; if it was solved, its own mesh is
+        A pose that cannot be solved or placed is named in the result's `refused`; if it was solved, its own mesh is
         written.
 
         Raises:
-            ReconstructionError: the first lie cannot be solved.
+            ReconstructionError: the first pose cannot be solved.
             OSError: a file cannot be written.
         """
         solved, refused = [], []
-        for number, (name, own) in enumerate((("", scenes), *lies)):
+        for number, (name, own) in enumerate((("", scenes), *object_poses)):
             small = tuple(reduced(scene, LONG_SIDES[SMALL]) for scene in own)
             try:
-                solved.append(SolvedLie(name, small, self._alone(withheld(small, self.seed), name, number)))
+                solved.append(SolvedObjectPose(name, small, self._alone(withheld(small, self.seed), name, number)))
             except ReconstructionError as error:
                 if not name:
                     raise
@@ -90,7 +95,7 @@ class _SmallSolves:
         known = tuple((one.name, withheld(one.scenes, self.seed)) for one in solved)
         attempts = count()
 
-        def solve(placed: tuple[PlacedLie, ...], start: SdfGrid) -> SdfGrid:
+        def solve(placed: tuple[PlacedObjectPose, ...], start: SdfGrid) -> SdfGrid:
             return self._all(joined_scenes(known[0][1], known[1:], placed), start, next(attempts))
 
         together = confirmed(solved, together, solve, self.seed, lambda text: self.run.progress(message=text))
@@ -104,22 +109,22 @@ class _SmallSolves:
         return replace(together, refused=tuple(refused))
 
     def _alone(self, scenes: Scenes, name: str, number: int) -> SolvedScene:
-        """Return a lie's own solve, from its file if there is one."""
-        path = self.run.file(f"{KEPT_LIE}_{number}.safetensors")
+        """Return a pose's own solve, from its file if there is one."""
+        path = self.run.file(f"{KEPT_OBJECT_POSE}_{number}.safetensors")
         if path.is_file():
             return load_fields(path)
         _, config = preset(SMALL, self.seed)
-        called = f"{name or 'the first lie'}, small"
+        called = f"{name or 'the first object pose'}, small"
         say = lambda text: self.run.activity(f"{called}: {text}")  # noqa: E731
         found = fit(scenes, config, _part(called, self.report), device=self.device, say=say)
         save_fields(found, path)
         return found
 
     def _all(self, scenes: Scenes, start: SdfGrid, attempt: int) -> SdfGrid:
-        """Return the small surface of the first lie and those that were placed; no trial of lights."""
+        """Return the small surface of the first pose and those that were placed; no trial of lights."""
         _, config = preset(SMALL, self.seed)
-        path = self.run.file(f"{KEPT_LIE}_all_{attempt}.safetensors")
-        earlier, part = begun(start, len(config.levels) - 1, scenes), _part("all lies, small", self.report)
+        path = self.run.file(f"{KEPT_OBJECT_POSE}_all_{attempt}.safetensors")
+        earlier, part = begun(start, len(config.levels) - 1, scenes), _part("all object poses, small", self.report)
         return fit_surface(scenes, config, part, path, self.device, earlier, self.run.activity)
 
 

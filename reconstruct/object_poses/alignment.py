@@ -1,13 +1,13 @@
-"""Find how an object was turned between two lies: the rigid motion that lays one solved surface on the other.
+"""Find how an object was turned between two object poses: the rigid motion that lays one solved surface on the other.
 
-In: the solved surface of each lie, and the points of it that its cameras saw. Out: the motion and how well it fits, or
+In: the solved surface of each pose, and the points of it that its cameras saw. Out: the motion and how well it fits, or
 a refusal in a sentence.
 
-1. Many rotations, each with the translation between the centres of volume, are scored by the distance of one lie's seen
-   points from the other's surface, both ways: the surfaces are distance functions, so no pairs are searched.
+1. Many rotations, each with the translation between the centres of volume, are scored by the distance of one pose's
+   seen points from the other's surface, both ways: the surfaces are distance functions, so no pairs are searched.
 2. The best are refined by iterated least squares on these distances [Fitzgibbon 2003, Robust Registration of 2D and 3D
    Point Sets], with weights that fall with the distance (Geman and McClure): undersides are cut off at the table, and
-   what a lie did not see is a guess.
+   what a pose did not see is a guess.
 3. Two different motions that fit equally well, within the noise of their difference, are told apart by colour, else
    refused.
 
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -27,17 +27,16 @@ from calibration.pose import Pose
 from capture.checks.robust import cauchy, geman_mcclure
 from capture.errors import ReconstructionError
 from reconstruct.fields import SolvedScene
-from reconstruct.lies.noise import mean_difference
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.sdf.grid import SdfGrid
 
 PHI = 2**0.5  # the two irrational numbers of the spiral
 PSI = 1.533751168755204288118041  # psi^4 = psi + 4
 ROTATIONS = 4096  # about 15 degrees apart
-FEWEST_POINTS = 50  # voxels that a lie's cameras see, at least
-FEW_POINTS = 250  # of each lie, for the first score
-SOME_POINTS = 1000  # of each lie, while many motions are refined
-MOST_POINTS = 8000  # of each lie, at the end
+FEWEST_POINTS = 50  # voxels that a pose's cameras see, at least
+FEW_POINTS = 250  # of each pose, for the first score
+SOME_POINTS = 1000  # of each pose, while many motions are refined
+MOST_POINTS = 8000  # of each pose, at the end
 REFINED = 32  # best rotations that are refined
 AT_ONCE = 128  # of the rotations
 APART = np.radians(12.0)  # nearer rotations end in the same motion
@@ -50,7 +49,7 @@ DISTINCT_SHIFT = 0.04
 SIGMAS = 3.0  # of the difference between two motions: below, neither is better
 BLOCKS = 8  # along the object: distances inside one are correlated
 FITS = 1.5  # voxels: median distance of the seen points from the other's surface, at most
-SAME_PLACE = 1.5  # voxels: points of both lies that show one place of the surface
+SAME_PLACE = 1.5  # voxels: points of both poses that show one place of the surface
 DARKEST = 0.01  # albedo below which no ratio is known
 
 
@@ -80,7 +79,7 @@ def stepped(pose: Pose, step: Float[np.ndarray, "6"], about: Float[np.ndarray, "
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """A lie's surface above its ground, and points of it that its cameras saw, one for each voxel. The lie's world."""
+    """A pose's surface above its ground, and points of it that its cameras saw, one for each voxel. Its own world."""
 
     name: str
     grid: SdfGrid
@@ -102,16 +101,16 @@ class SeenSurface:
 
 @dataclass(frozen=True)
 class Alignment:
-    """The motion between two lies, and how well it is known."""
+    """The motion between two poses, and how well it is known."""
 
     motion: Pose  # first_from_turned
-    distance: float  # median distance of seen points from the other lie's surface, world length
-    colour: float  # median difference of log albedo where both lies saw a place; nan where none was compared
+    distance: float  # median distance of seen points from the other pose's surface, world length
+    colour: float  # median difference of log albedo where both poses saw a place; nan where none was compared
     by_colour: bool  # colour decided between motions that fit equally well
 
 
 def seen_surface(name: str, fields: SolvedScene) -> SeenSurface:
-    """Return what the cameras of a lie saw of its surface.
+    """Return what the cameras of a pose saw of its surface.
 
     Raises:
         ReconstructionError: they saw too little.
@@ -128,7 +127,7 @@ def seen_surface(name: str, fields: SolvedScene) -> SeenSurface:
     _, chosen = np.unique(np.floor(points / fields.grid.spacing).astype(np.int64), axis=0, return_index=True)
     if len(chosen) < FEWEST_POINTS:
         raise ReconstructionError(
-            f"{name or 'the first lie'}: {len(chosen)} voxels of the object are seen by its cameras, at least "
+            f"{name or 'the first object pose'}: {len(chosen)} voxels of the object are seen by its cameras, at least "
             f"{FEWEST_POINTS} were needed to find how it was turned. Photograph it from nearer."
         )
     surface = _above_ground(fields.grid, fields.ground_height)
@@ -136,16 +135,16 @@ def seen_surface(name: str, fields: SolvedScene) -> SeenSurface:
 
 
 def _above_ground(grid: SdfGrid, height: float) -> SdfGrid:
-    """Return a surface without the matter below the ground, which nothing that is solved in one lie denies.
+    """Return a surface without the matter below the ground, which nothing that is solved in one pose denies.
 
-    So it has an underside where the object stands, and another lie may show it.
+    So it has an underside where the object stands, and another pose may show it.
     """
     z = grid.origin[2].double() + grid.spacing * torch.arange(grid.values.shape[2], dtype=torch.float64)
     return SdfGrid(torch.maximum(grid.values, (height - z).float()), grid.origin, grid.spacing)
 
 
 def align(first: SeenSurface, turned: SeenSurface, seed: int = 0) -> Alignment:
-    """Return the motion that carries a turned lie's world to that of the first lie.
+    """Return the motion that carries a turned pose's world to that of the first pose.
 
     Raises:
         ReconstructionError: the surfaces fit in no motion, or in two different ones equally well.
@@ -162,7 +161,7 @@ def align(first: SeenSurface, turned: SeenSurface, seed: int = 0) -> Alignment:
 
 
 class _Pairs:
-    """Seen points of both lies, and their distances from the other's surface under a motion first_from_turned."""
+    """Seen points of both poses, and their distances from the other's surface under a motion first_from_turned."""
 
     def __init__(self, first: SeenSurface, turned: SeenSurface, count: int, seed: int):
         self.first, self.turned = first, turned
@@ -178,7 +177,7 @@ class _Pairs:
     def signed(self, motion: Pose) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 6"]]:
         """Return signed distances, and their derivatives by a turn about the first's centre and a shift.
 
-        Points of the turned lie come first, on the first's surface.
+        Points of the turned pose come first, on the first's surface.
         """
         there = motion.apply(self.of_turned)
         phi, slope = self.field_first.at(there)
@@ -188,11 +187,11 @@ class _Pairs:
         return np.concatenate([phi, phi_back]), np.concatenate([np.cross(at - self.centre, slopes), slopes], 1)
 
     def distances(self, motion: Pose) -> Float[np.ndarray, " n"]:
-        """Return the distances of all points from the other lie's surface."""
+        """Return the distances of all points from the other pose's surface."""
         return self.distances_of([motion])[0]
 
     def distances_of(self, motions: Sequence[Pose]) -> Float[np.ndarray, "motions n"]:
-        """Return the distances of all points from the other lie's surface, for each of several motions."""
+        """Return the distances of all points from the other pose's surface, for each of several motions."""
         there = np.concatenate([motion.apply(self.of_turned) for motion in motions])
         back = np.concatenate([motion.inverse().apply(self.of_first) for motion in motions])
         parts = (self.field_first.at(there)[0], self.field_turned.at(back)[0])
@@ -216,9 +215,9 @@ class _Pairs:
         return motion
 
     def colour_errors(self, motion: Pose) -> Float[np.ndarray, " n"]:
-        """Return the difference of log albedo, beside one factor for each channel, where both lies saw a place.
+        """Return the difference of log albedo, beside one factor for each channel, where both poses saw a place.
 
-        Points of the turned lie come first; nan where the other lie did not see the place.
+        Points of the turned pose come first; nan where the other pose did not see the place.
         """
         there, back = motion.apply(self.of_turned), motion.inverse().apply(self.of_first)
         parts = []
@@ -235,7 +234,7 @@ class _Pairs:
         return np.concatenate(parts)
 
     def blocks(self) -> np.ndarray:
-        """Return the block of space of each point, those of either lie apart: errors inside one are correlated."""
+        """Return the block of space of each point, those of either pose apart: errors inside one are correlated."""
         labels = []
         for own in (self.of_turned, self.of_first):
             _, label = np.unique(np.floor(own / (self.size / BLOCKS)).astype(int), axis=0, return_inverse=True)
@@ -305,9 +304,9 @@ def _closely(pairs: _Pairs, motion: Pose) -> tuple[Pose, float]:
     distance, most = float(np.median(pairs.distances(motion))), FITS * pairs.voxel
     if distance > most:
         raise ReconstructionError(
-            f"{pairs.turned.name}: laid on {pairs.first.name or 'the other lie'} in the best of {ROTATIONS} rotations, "
-            f"the surfaces are {distance:.2g} mm apart (median); at most {most:.2g} mm were needed. Is it the same "
-            "object, and did it keep its shape?"
+            f"{pairs.turned.name}: laid on {pairs.first.name or 'the other object pose'} in the best of {ROTATIONS} "
+            f"rotations, the surfaces are {distance:.2g} mm apart (median); at most {most:.2g} mm were needed. Is it "
+            "the same object, and did it keep its shape?"
         )
     return motion, distance
 
@@ -334,11 +333,33 @@ def _ambiguous(pairs: _Pairs, a: Pose, b: Pose) -> str:
     losses = [float(pairs.losses(pose, width).mean()) for pose in (a, b)]
     _, noise = mean_difference(pairs.losses(a, width), pairs.losses(b, width), pairs.blocks())
     return (
-        f"{pairs.turned.name}: two ways to lay it on {pairs.first.name or 'the other lie'}, {apart:.0f} degrees apart, "
-        f"fit equally well (shape off by {100 * losses[0]:.3g} % and {100 * losses[1]:.3g} %, noise {100 * noise:.2g} "
-        "%, and colours do not decide). Shape or colour that tells them apart was needed: put a sticker on the object, "
-        "or photograph it so that both lies show more of the same sides."
+        f"{pairs.turned.name}: two ways to lay it on {pairs.first.name or 'the other object pose'}, {apart:.0f} "
+        f"degrees apart, fit equally well (shape off by {100 * losses[0]:.3g} % and {100 * losses[1]:.3g} %, noise "
+        f"{100 * noise:.2g} %, and colours do not decide). Shape or colour that tells them apart was needed: put a "
+        "sticker on the object, or photograph it so that both object poses show more of the same sides."
     )
+
+
+def mean_difference(
+    a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], group: Int[np.ndarray, " n"]
+) -> tuple[float, float]:
+    """Return the mean of a - b where both are known, and one sigma of it, from how it varies between groups.
+
+    The ratio estimator of cluster sampling [Cochran 1977, 6.4]: errors inside a group may be correlated. 0 and 0 with
+    fewer than two groups.
+
+    Args:
+        a, b: errors under two motions; nan where unknown.
+        group: of each error, counted from 0.
+    """
+    known = np.isfinite(a) & np.isfinite(b)
+    change, own = (a - b)[known], group[known]
+    total, count = np.bincount(own, change), np.bincount(own)
+    used = int((count > 0).sum())
+    if used < 2:
+        return 0.0, 0.0
+    mean = float(change.mean())
+    return mean, float(np.sqrt(used / (used - 1) * ((total - mean * count) ** 2).sum()) / known.sum())
 
 
 class _Field:

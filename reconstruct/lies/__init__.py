@@ -1,5 +1,0 @@
-"""An object laid anew on another side: how it was turned, and one surface from all of its lies.
-
-In: each lie's scenes, in its own world, and its own solve (SolvedLie). Out: the rigid motion of each lie into the world
-of the first, or the sentence that says why there is none, and the surface that a solve of all scenes begins with.
-"""
