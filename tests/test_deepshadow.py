@@ -68,7 +68,7 @@ def test_an_impossible_ground_is_refused_by_name(tmp_path, ground, words):
     ("file", "text", "words"),
     [
         ("all_object_lights.txt", "cup_0_0 1 2\n", "line 1"),
-        ("all_object_lights.txt", "\n", "names no picture"),
+        ("all_object_lights.txt", "\n", "lists no light"),
         ("all_object_lights.txt", "saucer_0_0 1 2 3\n", "saucer_0_0_shadow1.png"),
         ("params.json", "{", "not JSON"),
         ("params.json", '{"focal_length": -1}', "focal_length"),
