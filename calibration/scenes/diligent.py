@@ -86,8 +86,9 @@ def _table(path: Path, n_rows: int | None = None) -> Float[np.ndarray, "rows 3"]
     Raises:
         CalibrationError: anything else, or another number of rows than was needed.
     """
+    rows = [line.split() for line in read_text(path).replace(",", " ").splitlines() if line.strip()]
     try:
-        table = np.loadtxt(read_text(path).replace(",", " ").splitlines(), ndmin=2)
+        table = np.array(rows, float).reshape(len(rows), -1)
     except ValueError as error:
         raise CalibrationError(f"{path}: three numbers in each line were needed ({why(error)}).") from error
     if table.shape[0] == 3 and table.shape[1] != 3:

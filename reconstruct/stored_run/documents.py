@@ -180,8 +180,8 @@ def log_lines(content: bytes) -> list[dict[str, Any]]:
     for line in content.splitlines()[-MOST_LINES:]:
         try:
             lines.append(msgspec.to_builtins(msgspec.json.decode(line[:LONGEST_LINE], type=_Line)))
-        except ValueError:
-            continue  # the last line of a killed run
+        except (ValueError, RecursionError):
+            continue  # the last line of a killed run, or one nested without end
     return lines
 
 
