@@ -43,7 +43,7 @@ from capture.photos.photo import PhotoStack
 LOG = logging.getLogger(__name__)
 OTHER_POWER = 3.0  # factor between one flashlight's power in two photos
 POWER_SIGMAS = 6.0  # or in how much the other photos differ, where they do not tell their exposure
-SURE_SIGMA = 0.03  # of the range, half of what a shape bears: lights that shading alone places so need no outlines
+SURE_SIGMA = 0.06 / 1.61  # of the range: 95 % of errors in space are below 1.61 sigma (chi, 3), and a shape bears 6 %
 LARGEST_SIGMA = 0.25  # of the range, of a light that is used: the solver's shadow rays take over from there
 FEWEST_USED = 2 / 3  # of the photos that shading alone must place
 BY_SHADING = "lights: placed by how bright the ground is, and by nothing else"
