@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from reconstruct.object_poses.noise import mean_difference
 from scipy.spatial.transform import Rotation
 from synthetic import Look, Sphere, default_camera, grid_of, render
 
@@ -17,7 +16,7 @@ from reconstruct.labels.held_out import hold_out
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import placed_rays, supervise
 from reconstruct.object_poses import alignment
-from reconstruct.object_poses.alignment import SeenSurface, align, angle_between, stepped
+from reconstruct.object_poses.alignment import SeenSurface, align, angle_between, mean_difference, stepped
 from reconstruct.object_poses.motion_refine import ObjectPoseRays, compare, refined_motion
 from reconstruct.object_poses.together import SolvedObjectPose, lay_together, merged_surface
 from reconstruct.render.g_buffer import seen_material
