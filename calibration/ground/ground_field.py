@@ -16,9 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float16
 
-from capture.checks.robust import column_quantile, spread
-from capture.photos.channels import mean_of_channels
-from capture.photos.photo import smaller
+from capture.checks.robust import spread
 
 LONG_SIDE = 252  # px: the field is smooth; shadows a pixel of this size wide still count as shadows
 DEGREE = 4  # of the polynomial
@@ -119,8 +117,11 @@ def reduced(
     long_side: int = LONG_SIDE,
 ) -> tuple[Float[np.ndarray, "photos small_height small_width"], Bool[np.ndarray, "photos small_height small_width"]]:
     """Return the photos' grey (mean of RGB) and usable samples at a long side, or at their own size if that is less."""
-    grey = [smaller(mean_of_channels(photo.astype(np.float32)), long_side) for photo in rgb]
-    sure = [smaller(one.astype(np.float32), long_side) > 0.999 for one in usable]
+    height, width = rgb.shape[1:3]
+    scale = min(1.0, long_side / max(height, width))
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    grey = [cv2.resize(photo.mean(-1, dtype=np.float32), size, interpolation=cv2.INTER_AREA) for photo in rgb]
+    sure = [cv2.resize(one.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999 for one in usable]
     return np.stack(grey), np.stack(sure)
 
 
@@ -182,7 +183,9 @@ def _albedo(level: np.ndarray, seen: np.ndarray, before: np.ndarray, scale: floa
     """Return the log albedo of each pixel: a quantile over its usable photos, later their robust mean."""
     count = seen.sum(0)
     if is_first:
-        found = column_quantile(np.where(seen, level, np.nan), LIT_QUANTILE)
+        ordered = np.sort(np.where(seen, level, np.inf), axis=0)
+        place = np.clip(np.floor(LIT_QUANTILE * (count - 1)).astype(int), 0, len(level) - 1)
+        found = np.take_along_axis(ordered, place[None], 0)[0]
     else:
         weight = _votes(level - before, scale) * seen
         total = weight.sum(0)
@@ -209,25 +212,15 @@ def _smooth(log_light: np.ndarray, weight: np.ndarray, basis: np.ndarray, widths
     for share in widths:
         rest = (log_light - field).astype(np.float32)
         vote = (_votes(rest, scale) * trust.reshape(height, width)).astype(np.float32)
-        field = field + window_mean(rest, vote, share * max(height, width), FEWEST)
+        field = field + _window_mean(rest, vote, share * max(height, width))
     return field.ravel()
 
 
-def window_mean(
-    values: Float[np.ndarray, "height width *kinds"],
-    weight: Float[np.ndarray, "height width"] | Bool[np.ndarray, "height width"],
-    sigma: float,
-    least: float,
-) -> Float[np.ndarray, "height width *kinds"]:
-    """Return the weighted mean in a Gaussian window, at the resolution that it leaves.
-
-    Args:
-        sigma: of the window, px.
-        least: share of the window's weight below which the mean goes towards 0.
-    """
-    height, width = weight.shape
+def _window_mean(values: np.ndarray, weight: np.ndarray, sigma: float) -> np.ndarray:
+    """Return the weighted mean in a Gaussian window, at the resolution that it leaves; towards 0 without votes."""
+    height, width = values.shape
     step = max(1.0, sigma / 4)
     size = (max(2, round(width / step)), max(2, round(height / step)))
-    parts = np.dstack([values.reshape(height, width, -1) * weight[..., None], weight]).astype(np.float32)
-    sums = cv2.GaussianBlur(cv2.resize(parts, size, interpolation=cv2.INTER_AREA), (0, 0), sigma / step)
-    return cv2.resize(sums[..., :-1] / np.maximum(sums[..., -1:], least), (width, height)).reshape(values.shape)
+    parts = [cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (values * weight, weight)]
+    sums = [cv2.GaussianBlur(x, (0, 0), sigma / step) for x in parts]
+    return cv2.resize(sums[0] / np.maximum(sums[1], FEWEST), (width, height), interpolation=cv2.INTER_LINEAR)

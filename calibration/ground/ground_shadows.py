@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import label
 
 from calibration.ground.ground_field import GroundField, Maps
 from calibration.ground.outline_model import (
@@ -15,7 +16,6 @@ from calibration.ground.outline_model import (
     object_and_ground,
     shadowed_inside,
 )
-from calibration.ground.regions import parts_in
 
 GROUND_LIKE = -0.3  # mean log likelihood ratio of a photo below which a pixel is ground
 LIKELY = -0.1  # the same, from which a pixel is none
@@ -89,7 +89,10 @@ def of_one_ground(shadows: GroundShadows) -> GroundShadows:
         np.pad(line, LINE_GAP, constant_values=1), cv2.MORPH_CLOSE, np.ones((LINE_GAP, LINE_GAP), np.uint8)
     )
     line = (line[LINE_GAP:-LINE_GAP, LINE_GAP:-LINE_GAP] > 0) | shadows.object_mask
-    parts, sizes = parts_in(~line)
+    parts = np.empty(line.shape, np.int32)
+    label(~line, output=parts)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
     border = np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])
     beyond = np.setdiff1d(border, [0, int(sizes.argmax())])
     return replace(shadows, likelihood=np.where(np.isin(parts, beyond), np.float32(ODDS), shadows.likelihood))

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import label
 
-from calibration.ground.ground_field import GroundField, window_mean
+from calibration.ground.ground_field import GroundField
 from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows
-from calibration.ground.regions import parts_in
 
 BRIGHTEST = 1.0  # log units over the field: brighter counts as this, since the sensor clips there
 DULLEST, SIGMAS = 0.12, 4.0  # a spot's least height, log units and sigmas of the field's noise
@@ -82,9 +82,10 @@ def _brightest_spot(
     least: float,
 ) -> _Spot | None:
     """Return the spot with the largest sum; None where there is none, or its middle is out of sight."""
-    smooth = window_mean(excess, valid, BLUR, 0.3)
+    known = cv2.GaussianBlur(valid.astype(np.float32), (0, 0), BLUR)
+    smooth = cv2.GaussianBlur(excess, (0, 0), BLUR) / np.maximum(known, 0.3)
     smooth[~valid] = 0
-    pieces, _ = parts_in(smooth > LEVELS[0] * least)
+    pieces = _pieces(smooth > LEVELS[0] * least)
     sums = np.bincount(pieces.ravel(), np.maximum(excess, 0).ravel())
     sums[0] = 0
     if not sums.any():
@@ -126,7 +127,7 @@ def _highest(picture: Float[np.ndarray, "height width"]) -> tuple[float, tuple[i
 
 
 def _around(inside: Bool[np.ndarray, "height width"], place: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
-    pieces, _ = parts_in(inside)
+    pieces = _pieces(inside)
     return pieces == pieces[place]
 
 
@@ -142,3 +143,9 @@ def _frame(inside: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height
 
 def _share(some: np.ndarray, of: np.ndarray) -> float:
     return float(some.sum() / max(of.sum(), 1))
+
+
+def _pieces(inside: Bool[np.ndarray, "height width"]) -> Int[np.ndarray, "height width"]:
+    pieces = np.empty(inside.shape, np.int32)
+    label(inside, output=pieces)
+    return pieces

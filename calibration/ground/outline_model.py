@@ -20,11 +20,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Integer
-from scipy.ndimage import find_objects, gaussian_filter
+from scipy.ndimage import find_objects, gaussian_filter, label
 
-from calibration.ground.ground_field import DARK, DARKEST, GroundField, Maps, window_mean
-from calibration.ground.regions import cheapest_region, parts_in
-from capture.checks.robust import column_spread, lower_median, spread
+from calibration.ground.ground_field import DARK, DARKEST, GroundField, Maps
+from calibration.ground.min_cut import cheapest_region
+from capture.checks.robust import column_spread, spread
 
 POOLED = 1.5  # px, sigma of the window whose samples tell a level part's step together
 STEP = 0.1  # log units: usual step of a level part, as high as a 20th of the light's distance
@@ -47,7 +47,6 @@ EDGE = 3.0  # times the usual difference of neighbours: where a cut costs .6 of 
 SURE = 20.0  # nats: more is not believed
 ROUNDS = 4
 MOST_PARTS = 8  # of what is no ground, the largest of which one may be the object: the others are specks
-RAREST = 1e-9  # share of a window: the mean of what is that far away counts
 RIM = np.ones((7, 7), np.uint8)  # of the object: ground so near it may be a part of it, or mixed with it
 
 Map = Float[np.ndarray, "height width"]
@@ -85,7 +84,7 @@ def object_and_ground(
     told = count >= FEWEST_PHOTOS
     by_light, links = np.where(told, np.clip(worth * mean, -SURE, SURE), 0), _links(field)
     odds, gaps, albedo = by_light, np.zeros_like(told), field.albedo
-    region = cheapest_region(odds, *links)
+    region = _cut(odds, links)
     for _ in range(ROUNDS):
         thing = shadowed_inside(field, region)
         if not thing.any():
@@ -98,7 +97,7 @@ def object_and_ground(
         in_gap = np.where(told, np.clip(in_gap + shown - by_light + said / 2, -SURE, SURE), SURE)
         beside = shown + samples.look_odds(region, thing) + said
         before, either = region, np.minimum(beside, in_gap)
-        if not (after := cheapest_region(either, *links)).any():  # a gap lies beside an object: not all of it is one
+        if not (after := _cut(either, links)).any():  # a gap lies beside an object: not all of it is one
             break
         shaded = ((field.residual + field.albedo - near[..., 0] < DARK) & usable).sum(0) >= count / 2
         gaps, odds, region = (beside > 0) & (in_gap < 0) & shaded, either, after
@@ -195,10 +194,10 @@ class _Samples:
         total, count = np.zeros(lit.shape[1:]), np.zeros(lit.shape[1:])
         for one, seen in zip(self.field.residual, lit, strict=True):
             weight = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), POOLED)
-            step = window_mean(one, seen, POOLED, 0.1)
+            step = cv2.GaussianBlur(np.where(seen, one, 0).astype(np.float32), (0, 0), POOLED) / np.maximum(weight, 0.1)
             shown = seen & (weight > 0.5)
             bare = shown & self.follows & ~thing
-            missed = np.sqrt(window_mean(step**2, bare, 2 * float(thing.sum()) ** 0.5, RAREST))
+            missed = np.sqrt(_window_mean(step**2, bare, 2 * float(thing.sum()) ** 0.5))
             missed = np.maximum(missed, max(spread(step[bare]), NARROWEST / POOLED))
             gain = step**2 / 2 * (1 / missed**2 - 1 / STEP**2) - np.log(STEP / missed)
             total += np.clip(gain, -ODDS, ODDS) * shown
@@ -209,8 +208,8 @@ class _Samples:
         """Return log albedo and colours of the bare ground around each pixel, and how they scatter."""
         bare = self.follows & ~(cv2.dilate(region.astype(np.uint8), RIM) > 0)
         told, sigma = np.dstack([self.field.albedo, self.ground]), AROUND * float(thing.sum()) ** 0.5
-        near = window_mean(told, bare, sigma, RAREST)
-        return near, np.sqrt(window_mean((told - near) ** 2, bare, sigma, RAREST))
+        near = _window_mean(told, bare, sigma)
+        return near, np.sqrt(_window_mean((told - near) ** 2, bare, sigma))
 
     def gap_odds(self, near: Look, scatter: Look, thing: Region) -> Maps:
         """Return log odds of object over ground in a gap, sample by sample.
@@ -236,10 +235,10 @@ class _Samples:
         low, high = np.quantile(self.look, 0.002, axis=(0, 1)), np.quantile(self.look, 0.998, axis=(0, 1))
         span = np.maximum(high - low, 0.05)
         cells = np.clip((self.look - low) / span * BINS, 0, BINS - 1).astype(int)
-        of_ground = smooth_histogram(cells[_away(thing, region)], BINS)
+        of_ground = _histogram(cells[_away(thing, region)])
         centres = low[0] + (np.arange(BINS) + 0.5) / BINS * span[0]
         brightness = _gaussian(centres - np.median(self.look[thing, 0]), OBJECT_WIDTH)
-        of_object = (brightness / brightness.sum())[:, None, None] * smooth_histogram(cells[thing][:, 1:], BINS)
+        of_object = (brightness / brightness.sum())[:, None, None] * _histogram(cells[thing][:, 1:])
         strange = STRANGE / BINS**3
         odds = np.log(((1 - STRANGE) * of_object + strange) / ((1 - STRANGE) * of_ground + strange))
         return odds[tuple(np.moveaxis(cells, -1, 0))]
@@ -281,7 +280,9 @@ def _medians(colour: np.ndarray, where: Bool[np.ndarray, "photos height width"],
 
 def _median(values: Maps, known: Bool[np.ndarray, "photos height width"]) -> Map:
     """Return the lower median over the photos that know a pixel; 0 where none does."""
-    return np.nan_to_num(lower_median(np.where(known, values, np.float32(np.nan))))
+    ordered, count = np.sort(np.where(known, values, np.inf), axis=0), known.sum(0)
+    middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[None] // 2, 0)[0]
+    return np.where(count > 0, middle, 0).astype(np.float32)
 
 
 def _links(field: GroundField) -> list[np.ndarray]:
@@ -295,6 +296,10 @@ def _links(field: GroundField) -> list[np.ndarray]:
     return [LINK * np.exp(-((step / (EDGE * usual)) ** 2) / 2).astype(float) for step in steps]
 
 
+def _cut(odds: Map, links: list[np.ndarray]) -> Region:
+    return cheapest_region(np.maximum(-odds, 0).astype(float), np.maximum(odds, 0).astype(float), *links)
+
+
 def _away(thing: Region, region: Region) -> Region:
     extent = max(np.ptp(places) for places in np.nonzero(thing)) + 1
     distance = cv2.distanceTransform((~thing).astype(np.uint8), cv2.DIST_L2, 5)
@@ -302,9 +307,18 @@ def _away(thing: Region, region: Region) -> Region:
     return next((one for one in found if one.sum() > ENOUGH * one.size), ~region)
 
 
-def smooth_histogram(cells: np.ndarray, bins: int) -> np.ndarray:
-    """Return the share of each cell, smoothed; `cells`: the bin along each axis, of each sample."""
-    counts = np.zeros((bins,) * cells.shape[-1])
+def _window_mean(values: Float[np.ndarray, "height width *kinds"], where: Region, sigma: float) -> np.ndarray:
+    """Return the mean over a Gaussian window of the pixels in `where`, at the resolution that it leaves."""
+    height, width = where.shape
+    weight, shrink = where.astype(np.float32)[..., None], max(1.0, sigma / 6)
+    size = (max(4, round(width / shrink)), max(4, round(height / shrink)))
+    parts = np.dstack([values.reshape(height, width, -1) * weight, weight]).astype(np.float32)
+    sums = cv2.GaussianBlur(cv2.resize(parts, size, interpolation=cv2.INTER_AREA), (0, 0), sigma / shrink)
+    return cv2.resize(sums[..., :-1] / np.maximum(sums[..., -1:], 1e-9), (width, height)).reshape(values.shape)
+
+
+def _histogram(cells: np.ndarray) -> np.ndarray:
+    counts = np.zeros((BINS,) * cells.shape[-1])
     np.add.at(counts, tuple(cells.T), 1.0)
     return gaussian_filter(counts, 0.7, mode="nearest") / max(len(cells), 1)
 
@@ -315,8 +329,10 @@ def shadowed_inside(field: GroundField, region: Region) -> Region:
     Print on the ground may be larger than the object, but throws no shadow. If nothing does, the largest is meant; the
     result is empty if every part reaches the picture's border.
     """
-    parts, sizes = parts_in(region)
-    sizes[np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])] = 0
+    parts = np.empty(region.shape, np.int32)
+    label(region, output=parts)
+    sizes = np.bincount(parts.ravel())
+    sizes[np.concatenate([[0], parts[0], parts[-1], parts[:, 0], parts[:, -1]])] = 0
     if not sizes.any():
         return np.zeros_like(region)
     dark, boxes = (field.usable & (field.residual < DARK)).mean(0), find_objects(parts)

@@ -12,11 +12,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import binary_fill_holes
+from scipy.ndimage import binary_fill_holes, convolve1d, label
 
-from calibration.ground.ground_field import window_mean
-from calibration.ground.outline_model import smooth_histogram
-from calibration.ground.regions import cheapest_region, parts_in
+from calibration.ground.min_cut import cheapest_region
 from calibration.posed_camera import PosedCamera
 from calibration.side_photos.ground_look import DARKEST, NARROWEST, SEEN_WIDTH, GroundLook, TripodView, ground_look
 from capture.checks.robust import column_spread
@@ -33,7 +31,6 @@ ANYTHING = 3.0  # nats: what an object costs that may have any colour
 UNSEEN = 1.5  # nats: what the tripod's picture does not show is rather more table
 COLOURS = 12  # bins of each colour axis
 LINK = 12.0  # nats: cost of a cut between alike pixels
-OUTSIDE = 20.0  # nats: more than any odds
 ROUNDS = 3
 FAVOUR = 1.5  # nats for one pixel
 RIM = 3  # px to both sides of the outline in which it may lie
@@ -228,8 +225,11 @@ def _mean_near(
     values: Float[np.ndarray, "height width 3"], region: Bool[np.ndarray, "height width"]
 ) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
     """Return the mean of a region's values near each pixel, and where there are any."""
-    there = cv2.GaussianBlur(region.astype(np.float32), (0, 0), RIM) > 1e-2
-    return window_mean(values, region, float(RIM), 1e-6), there
+    weight = region.astype(np.float32)
+    total, count = (
+        cv2.GaussianBlur(one, (0, 0), RIM) for one in (values.astype(np.float32) * weight[..., None], weight)
+    )
+    return total / np.maximum(count, 1e-6)[..., None], count > 1e-2
 
 
 def _maybe_shade(mask: Bool[np.ndarray, "height width"], look: GroundLook) -> Bool[np.ndarray, "height width"]:
@@ -284,19 +284,30 @@ def _colour_odds(log: np.ndarray, thing: np.ndarray, rest: np.ndarray) -> Float[
     axes = np.stack([log.mean(-1), log[..., 0] - log[..., 2], log[..., 1] - 0.5 * (log[..., 0] + log[..., 2])], -1)
     low, high = np.quantile(axes, 0.005, axis=(0, 1)), np.quantile(axes, 0.995, axis=(0, 1))
     index = np.clip((axes - low) / np.maximum(high - low, 1e-3) * COLOURS, 0, COLOURS - 1).astype(int)
-    of_thing, of_rest = (smooth_histogram(index[some], COLOURS) + 0.3 / COLOURS**3 for some in (thing, rest))
-    odds = np.log(of_thing / of_rest)
+    counts = []
+    for chosen in (thing, rest):
+        cells = np.zeros((COLOURS,) * 3, np.float32)
+        np.add.at(cells, tuple(index[chosen].T), 1.0)
+        for axis in range(3):
+            cells = convolve1d(cells, [0.25, 0.5, 0.25], axis, mode="nearest")
+        counts.append(cells / max(cells.sum(), 1e-6) + 0.3 / COLOURS**3)
+    odds = np.log(counts[0] / counts[1])
     return np.clip(odds[tuple(np.moveaxis(index, -1, 0))], -ANYTHING, ANYTHING)
 
 
 def _cut(odds: np.ndarray, links: list[np.ndarray], region: np.ndarray, favour: float) -> Bool[np.ndarray, "h w"]:
     """Return the cheapest cut; outside the region there is no object."""
-    return cheapest_region(np.where(region, odds + favour, -OUTSIDE), *links)
+    gain = np.where(region, odds + favour * (region & (np.abs(odds) < 20)), -20.0).astype(float)
+    zero = np.zeros_like(gain)
+    return cheapest_region(np.maximum(-gain, zero), np.maximum(gain, zero), *(one.astype(float) for one in links))
 
 
 def _nearest(mask: Bool[np.ndarray, "height width"], place: Float[np.ndarray, "2"]) -> Bool[np.ndarray, "height width"]:
     """Return the part of the mask, holes filled, that is nearest to a pixel; of those that are not small."""
-    parts, sizes = parts_in(mask)
+    parts = np.empty(mask.shape, np.int32)
+    label(mask, output=parts)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
     if not sizes.any():
         return np.zeros_like(mask)
     rows, columns = np.nonzero(mask & (sizes[parts] >= RIVAL * sizes.max()))

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int8
+from scipy.ndimage import label
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from calibration.ground.ground_field import DARK as SHADOW
 from calibration.ground.ground_field import DARKEST, GroundField, at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import LIKELY, BareGround, bare_ground
-from calibration.ground.regions import parts_in
 from calibration.ground.table_edges import seen_beyond
 from reconstruct.labels.ground_test import (
     NOISE_FLOOR,
@@ -225,7 +225,10 @@ def _background(
     points: Float[np.ndarray, "height width 3"],
 ) -> Bool[np.ndarray, "height width"]:
     """Return what is no ground, though no object, and all that lies farther from the camera in the same direction."""
-    parts, sizes = parts_in((bare.shadows.likelihood > LIKELY) & ~region)
+    parts = np.empty(region.shape, np.int32)
+    label((bare.shadows.likelihood > LIKELY) & ~region, output=parts)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
     no_ground = (sizes > BACKGROUND * region.size)[parts]
     across = points[..., :2] - scene.eye[:2].numpy()
     away = np.nan_to_num(np.linalg.norm(across, axis=-1), nan=np.inf)

@@ -1,8 +1,7 @@
-"""Regions of a picture: the one of least cost (minimum cut), and the connected parts of one."""
+"""Segmentation of a picture into two regions at least cost (minimum cut)."""
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, Integer
+from jaxtyping import Bool, Float, Integer
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 
@@ -10,22 +9,23 @@ RESOLUTION = 1000  # integer units per unit of cost: the flow is exact in intege
 
 
 def cheapest_region(
-    gain: Float[np.ndarray, "height width"],
+    cost_in: Float[np.ndarray, "height width"],
+    cost_out: Float[np.ndarray, "height width"],
     across_columns: Float[np.ndarray, "height width_less_1"],
     across_rows: Float[np.ndarray, "height_less_1 width"],
 ) -> Bool[np.ndarray, "height width"]:
-    """Find the region that is worth most: the gains of its pixels, less the costs of cut links.
+    """Find the region of least cost: inside costs of its pixels, outside costs of the others, and costs of cut links.
 
     Solved exactly as a minimum cut (Greig, Porteous and Seheult 1989), by scipy's maximum flow.
 
     Args:
         across_columns, across_rows: cost of a link between neighbours in a row, and in a column.
     """
-    height, width = gain.shape
+    height, width = cost_in.shape
     count = height * width
     source, sink = count, count + 1
     place = np.arange(count).reshape(height, width)
-    gain = gain.ravel().astype(float)
+    gain = (cost_out - cost_in).ravel()
     links = [
         (np.full(count, source), place.ravel(), np.maximum(gain, 0)),
         (place.ravel(), np.full(count, sink), np.maximum(-gain, 0)),
@@ -45,16 +45,6 @@ def cheapest_region(
     inside = np.zeros(count + 2, bool)
     inside[breadth_first_order(left, source, return_predecessors=False)] = True
     return inside[:count].reshape(height, width)
-
-
-def parts_in(
-    region: Bool[np.ndarray, "height width"],
-) -> tuple[Int[np.ndarray, "height width"], Int[np.ndarray, " parts"]]:
-    """Label the connected parts of the region from 1, 0 outside; return also the pixels of each, and 0 for outside."""
-    _, parts, stats, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8), connectivity=4)
-    sizes = stats[:, cv2.CC_STAT_AREA].copy()
-    sizes[0] = 0
-    return np.asarray(parts), sizes
 
 
 def parts_of(
