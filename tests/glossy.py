@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 from jaxtyping import Float
+from synthetic import Truth
 
 from calibration.light import Light, irradiance
 from reconstruct.scene import Scene
-from tests.synthetic import Truth
 
 
 def ggx(

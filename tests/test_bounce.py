@@ -6,7 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from fake_run import fields_of
 from jaxtyping import Float
+from synthetic import BALL, HEAP, Look, grid_of, render
+from test_relight import CAMERA, CENTRE, POSE, RADIUS, sphere_grid
 from torch.nn.functional import normalize
 
 from calibration.light import Light
@@ -20,9 +23,6 @@ from reconstruct.render.interreflection import photo_interreflection, true_scale
 from reconstruct.render.radiosity import find_patches
 from reconstruct.render.relight import environment, relight
 from reconstruct.sdf.grid import SdfGrid
-from tests.fake_run import fields_of
-from tests.synthetic import BALL, HEAP, Look, grid_of, render
-from tests.test_relight import CAMERA, CENTRE, POSE, RADIUS, sphere_grid
 
 HEIGHT = float(CENTRE[2])
 OVERHEAD = Light("", "directional", direction=np.array([0.0, 0.0, 1.0]))

@@ -6,8 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from glossy import highlight, polished
 from jaxtyping import Float
 from scipy import ndimage
+from synthetic import BALL, Look, Sphere, Truth, grid_of, render
 from torch import Tensor
 
 from calibration.light import Light, irradiance
@@ -29,8 +31,6 @@ from reconstruct.render.g_buffer import look
 from reconstruct.render.relight import relight
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
-from tests.glossy import highlight, polished
-from tests.synthetic import BALL, Look, Sphere, Truth, grid_of, render
 
 LOOK = Look(n_lights=24, texture=0.3, noise=0.002)
 ROUGHNESS, F0 = 0.4, 0.08

@@ -7,6 +7,7 @@ import pytest
 import torch
 from brief_drafts import NORMAL_STEPS
 from scipy.ndimage import binary_erosion
+from synthetic import BALL, Box, Look, Sphere, render
 
 from reconstruct.config import FitConfig, Level
 from reconstruct.hull import bent_hull
@@ -17,7 +18,6 @@ from reconstruct.labels.observer import Observer
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
 from reconstruct.shading import joint_normals
-from tests.synthetic import BALL, Box, Look, Sphere, render
 
 SLAB = Box((-45.0, -30.0, 0.0), (45.0, 30.0, 20.0))
 HEAD = Sphere((10.0, 0.0, 12.0), 22.0)

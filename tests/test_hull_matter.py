@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from synthetic import Box, Look, grid_of, render
 
 from reconstruct.hull.hull_matter import hull_occupancy
 from reconstruct.hull.normal_integration import integrate_within, likeness
 from reconstruct.labels.labels import Labels
-from tests.synthetic import Box, Look, grid_of, render
 
 WALL, SIZE, HIGH, FLOOR = 5.0, 40.0, 30.0, 6.0  # mm
 TRAY = (

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import binary_erosion
+from synthetic import Box, Look, render
 
 from reconstruct.hull.follow_normals import follow_normals
 from reconstruct.hull.normal_integration import integrate_behind, integrate_normals, integrate_within
@@ -13,7 +14,6 @@ from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
-from tests.synthetic import Box, Look, render
 
 BLOCK = Box((-45.0, -30.0, 0.0), (45.0, 30.0, 40.0))
 
