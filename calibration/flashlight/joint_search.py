@@ -138,15 +138,19 @@ def _both(like: Flashlights, places: Float[np.ndarray, "photos 3"], evidence: Ev
     Rings and response stand in for what is wrong with places far off; few terms lead to places nearer the truth.
     """
     smooth = replace(like, positions=places, beam=like.beam[:SMOOTH_TERMS], response=np.zeros(0))
-    smooth, weight = refine(smooth, replace(evidence, outlines=None), ALIKE_POWER, places_held, FAR[:6])
+    smooth, weight = _lighting(smooth, evidence)
     return _shaded(like, places, like.wall, evidence), _judged(bent(smooth, evidence), evidence, weight)
 
 
 def _shaded(like: Flashlights, places: Float[np.ndarray, "photos 3"], wall: Wall, evidence: Evidence) -> _Found:
     """Return the state with such places and wall whose beam, aims, powers and response shade the ground best."""
-    state = replace(like, positions=places, wall=wall)
-    state, weight = refine(state, replace(evidence, outlines=None), ALIKE_POWER, places_held, FAR[:6])
+    state, weight = _lighting(replace(like, positions=places, wall=wall), evidence)
     return _judged(state, evidence, weight)
+
+
+def _lighting(state: Flashlights, evidence: Evidence) -> tuple[Flashlights, Samples]:
+    """Return the state whose beam, aims, powers and response shade the ground best, its places held, and weights."""
+    return refine(state, replace(evidence, outlines=None), ALIKE_POWER, places_held, FAR[:6])
 
 
 def farther(

@@ -33,12 +33,6 @@ def column_quantile(values: Float[np.ndarray, "rows ..."], share: float) -> Floa
     return (low + (rank - below) * (high - low)).astype(values.dtype)
 
 
-def lower_median(values: Float[np.ndarray, "..."], axis: int = 0) -> Float[np.ndarray, "..."]:
-    """Return the median of what is not NaN, of an even count the lower one; NaN where nothing is known."""
-    ordered, count = np.sort(values, axis=axis), (~np.isnan(values)).sum(axis, keepdims=True)
-    return np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis).squeeze(axis)
-
-
 def reweighted_fit(
     basis: Float[np.ndarray, "n k"],
     values: Float[np.ndarray, "fits n"],
