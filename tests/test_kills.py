@@ -14,7 +14,7 @@ from waiting import PATIENCE_S
 
 TESTS = Path(__file__).parent
 KILLS = ("capture", "calibrate", "hull", "solve", "mesh")  # the stage in whose first lines of log it is killed
-RESULTS = ("mesh.ply", "mesh.glb", "depth.npy", "normal.npy", "mask.png", "fields.safetensors", "calibration.json")
+RESULTS = ("calibration.json", "fields.safetensors", "mesh.ply", "mesh.glb", "depth.npy", "normal.npy", "mask.png")
 FEW_PHOTOS = 8  # of each view
 ROOMS = (4_000, 150_000, 1_000_000)  # bytes of the longest file that the disk takes: no photos, no mesh, no fields
 
