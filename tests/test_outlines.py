@@ -39,6 +39,15 @@ def test_right_lights_agree_and_wrong_ones_contradict(ball):
     assert terms.misfit(moved)[3] > 1.0
 
 
+def test_a_photo_in_which_no_shadow_is_found_empties_no_space(ball):
+    _, lights, maps = ball
+    every, others = np.ones(len(lights), bool), maps.owner != 3
+    fields = np.where(np.arange(len(maps.fields))[:, None, None] == 3, np.abs(maps.fields), maps.fields)
+    parts = {name: getattr(maps, name)[others] for name in ("starts", "owner", "first_height")}
+    terms = OutlineTerms(replace(maps, fields=fields, **parts), EYE, 0.0, every, every)
+    assert np.median(terms.misfit(lights)) < 0.3
+
+
 def test_derivatives_are_those_of_differences(ball):
     _, lights, maps = ball
     every = np.ones(len(lights), bool)

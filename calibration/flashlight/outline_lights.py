@@ -136,11 +136,11 @@ def _terms(
 ) -> OutlineTerms | None:
     """Return the outlines of all photos, those trusted that the picture does not cut; None with too few shadows."""
     maps = outline_maps(field, shadows, posed_camera, is_hull_unknown)
-    if maps is None or len(np.unique(maps.owner)) < LEAST_SHADOWS * maps.n_photos():
+    if maps is None or maps.is_outlined().mean() < LEAST_SHADOWS:
         return None
     maps = with_cues(maps, cues, posed_camera)
     every = np.ones(maps.n_photos(), bool)
-    whole = ~maps.is_cut & np.isin(np.arange(maps.n_photos()), maps.owner)
+    whole = ~maps.is_cut & maps.is_outlined()
     points, down = ground_points(posed_camera.resized(*coarse.albedo.shape[::-1]))
     spots = find_highlights(coarse, find_shadows(coarse), np.where(down[..., None], points, np.nan))
     trusted = whole if whole.sum() >= FEWEST_WHOLE else every

@@ -49,6 +49,10 @@ class OutlineMaps:
         """Return the number of photos."""
         return len(self.dark)
 
+    def is_outlined(self) -> Bool[np.ndarray, " photos"]:
+        """Return which photos show an outline: what no shadow is found in proves no space empty."""
+        return np.isin(np.arange(self.n_photos()), self.owner)
+
 
 def outline_maps(
     field: GroundField, shadows: GroundShadows, posed_camera: PosedCamera, is_hull_unknown: bool = False

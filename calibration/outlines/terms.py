@@ -127,6 +127,7 @@ class OutlineTerms:
         lights, used = np.ones((len(self.used), 3)), self.used.copy()
         lights[self.used] = positions - lift
         used[self.used] = takes_part
+        used &= self.maps.is_outlined()
         for before, at, found in self._looks:  # cost and rows of one state, one after the other
             if np.array_equal(before, used) and np.array_equal(at, lights):
                 return found
