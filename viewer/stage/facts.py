@@ -20,8 +20,7 @@ from capture.errors import UserError
 from capture.photos.photo import decode_srgb
 from reconstruct.appearance.brdf import MATERIALS, SHARPNESS, facing_reflectances
 from reconstruct.export.export import UNIT_WORDS
-from reconstruct.export.first_view import LAMP, SKY
-from reconstruct.export.stage_scene import FULL_WEIGHT, GROUND_HALF, StageScene
+from reconstruct.export.stage_scene import FULL_WEIGHT, GROUND_HALF, LAMP, SKY, StageScene
 from reconstruct.fields import SolvedScene
 from reconstruct.render.studio import KEY_DISTANCE, LAMP_RADII, Studio, direction_of, looking_at, towards
 from reconstruct.stored_run.stage_pack import FORMAT

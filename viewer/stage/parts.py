@@ -8,8 +8,7 @@ from jaxtyping import Float, Shaped, UInt8
 
 from calibration.camera import Camera
 from calibration.posed_camera import PosedCamera
-from reconstruct.export.first_view import FirstView
-from reconstruct.export.stage_scene import StageScene, detail_pictures, stage_scene
+from reconstruct.export.stage_scene import FirstView, StageScene, detail_pictures, stage_scene
 from reconstruct.render.studio import Studio, studio_of
 from reconstruct.stored_run.maps import read_thumbnails
 from reconstruct.stored_run.stage_pack import stage_archive
