@@ -16,7 +16,7 @@ from capture.errors import CalibrationError
 from capture.files.names import inside
 from capture.files.schema import Number, Positive, read_scene, read_text
 from capture.photos.photo import read_grey
-from capture.session.scene_photos import scene_photos
+from capture.session.sorting import scene_photos
 
 LIGHTS, PARAMETERS, PICTURES = "all_object_lights.txt", "params.json", "0"
 BACKGROUND = 0.5  # of the silhouette's white: darker pixels are bare ground

@@ -26,7 +26,7 @@ from calibration.scenes.distant_camera import distant_light, distant_scene, pict
 from capture.decode.formats import read_size
 from capture.errors import CalibrationError, CaptureError
 from capture.photos.photo import read_stack
-from capture.session.scene_photos import ScenePhotos, scene_photos
+from capture.session.sorting import ScenePhotos, scene_photos
 
 LONG_SIDE = 1000  # px of the pictures in which ball and highlights are measured
 FEWEST_LIGHTS = 4  # photos whose highlight was found

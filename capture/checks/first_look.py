@@ -16,8 +16,7 @@ from capture.photos.photo import Photo, PhotoStack, read_small_photo, stack_of
 from capture.session.capture import by_place
 from capture.session.seen import SeenPhotos
 from capture.session.session import Session, SessionSettings, load_settings, named_photos
-from capture.session.skipped import photos_of
-from capture.session.sorting import ROLE_FOLDERS, is_beside, roles_so_far, sound_photos, stored_photos
+from capture.session.sorting import ROLE_FOLDERS, is_beside, photos_of, roles_so_far, sound_photos, stored_photos
 
 LONG_SIDE = 320  # px: shows blur of a pixel of the solver's draft, and a camera that moved by a few pixels of the photo
 COMPANIONS = 6  # photos that new ones are compared with: more cost seconds and tell no more

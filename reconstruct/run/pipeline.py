@@ -19,11 +19,14 @@ A stage that an earlier invocation finished is not repeated: its result is read 
 import platform
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 
+import numpy as np
+import torch
 from PIL import Image
 
 from calibration.calibrated_views import CalibratedViews, load_views, save_views
+from calibration.posed_camera import PosedCamera
 from capture.errors import CaptureError
 from capture.files.title import hand_title_on
 from capture.photos.photo import read_thumbnail
@@ -32,7 +35,6 @@ from reconstruct.check.readiness import refuse_hopeless
 from reconstruct.check.verdict import check_capture
 from reconstruct.fields import SolvedScene, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh
-from reconstruct.run.ball_on_ground import without_ball
 from reconstruct.run.machine import kernels_are_compiled, measure_speed, planned_seconds, whole_seconds, work_of
 from reconstruct.run.presets import solver_config
 from reconstruct.run.report_json import summary, versions
@@ -40,8 +42,8 @@ from reconstruct.run.results import detail_is_asked, save_results, write_detail
 from reconstruct.run.solve_stage import solve
 from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder, content_hash
 from reconstruct.run_folder.forecast import duration_text, plan_numbers
-from reconstruct.run_folder.once import Lazy, once
-from reconstruct.run_folder.progress import log_to
+from reconstruct.run_folder.progress import Lazy, log_to, once
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.backend import backend_name, solver_device
 from reconstruct.source.calibrate_source import calibrate_source, in_millimetres, with_scale_of
 from reconstruct.source.photos import Photos, Plan, keep_spread, memory_plan, read_photos, read_plan
@@ -250,3 +252,22 @@ def write_thumbnails(source: Source, run: RunFolder, first: str | None = None) -
         for photo in view.photos():
             with run.writing(f"{THUMBS}/{thumbnail_name(before + photo.name)}") as path:
                 Image.fromarray(read_thumbnail(photo, THUMBNAIL_LONG_SIDE)).save(path, quality=THUMBNAIL_QUALITY)
+
+
+def without_ball(fields: SolvedScene, circle: tuple[float, float, float], posed_camera: PosedCamera) -> SolvedScene:
+    """Return the surface without a ball that stands on the ground.
+
+    Args:
+        circle: x, y, radius of the ball and a rim about it, px of `posed_camera`.
+        posed_camera: in the frame of the fields.
+    """
+    x, y, radius = circle
+    ray, slope = posed_camera.rays(np.array([[x, y]]))[0], radius / posed_camera.camera.fx
+    eye, ground = posed_camera.centre, posed_camera.ground_height
+    t = (eye[2] - ground) / (slope * float(ray @ posed_camera.forward) - ray[2])  # its middle lies a radius above
+    middle, size = eye + t * ray, slope * t * float(ray @ posed_camera.forward)
+    grid = fields.grid
+    nodes = [grid.origin[i].item() + grid.spacing * np.arange(n) - middle[i] for i, n in enumerate(grid.values.shape)]
+    away = np.sqrt(nodes[0][:, None, None] ** 2 + nodes[1][:, None] ** 2 + nodes[2] ** 2)
+    values = torch.maximum(grid.values, torch.from_numpy(size - away).to(grid.values.dtype))
+    return replace(fields, grid=SdfGrid(values, grid.origin, grid.spacing))

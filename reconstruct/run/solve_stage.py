@@ -21,7 +21,7 @@ from reconstruct.run.machine import within_budget, work_of
 from reconstruct.run.object_poses_stage import forget_object_poses, joined_object_poses
 from reconstruct.run.presets import config_from_json, continued, solver_config, training
 from reconstruct.run_folder.folder import KEPT, RunFolder
-from reconstruct.run_folder.once import Lazy
+from reconstruct.run_folder.progress import Lazy
 from reconstruct.run_folder.requests import (
     NEXT_LEVEL,
     ON_REQUEST,

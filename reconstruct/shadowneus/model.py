@@ -4,8 +4,7 @@ import torch
 from torch import nn
 
 from reconstruct.shadowneus.config import TrainConfig
-from reconstruct.shadowneus.field import GridField, HashField, ball_on_ground
-from reconstruct.shadowneus.mlp_field import Materials, NeuralField, Sharpness
+from reconstruct.shadowneus.field import GridField, HashField, Materials, NeuralField, Sharpness, ball_on_ground
 
 START_POINTS, START_RATE = 1024, 3e-3  # per step of the fit to the ball on the ground, and its learning rate
 INNER = 0.6  # of the bounding cube: the points of every other step are in this part

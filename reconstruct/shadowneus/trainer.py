@@ -22,9 +22,15 @@ from reconstruct.scene import Scene
 from reconstruct.shadowneus.camera_rays import CameraRays, find_hits
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.model import Model
-from reconstruct.shadowneus.train_pixels import TrainPixels, make_train_pixels
+from reconstruct.shadowneus.train_pixels import (
+    TrainPixels,
+    UnitFrame,
+    make_train_pixels,
+    object_frame,
+    read_onto_grid,
+    unit_height,
+)
 from reconstruct.shadowneus.train_step import losses
-from reconstruct.shadowneus.unit_frame import UnitFrame, object_frame, read_onto_grid, unit_height
 from reconstruct.solve.checkpoint import FINGERPRINT, FORMAT, Log, fingerprint, read_checkpoint, write_checkpoint
 from reconstruct.solve.level import Steering
 from reconstruct.solve.solver import NO_STEERING, SolveReporter

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from calibration.calibration import Calibration
 from calibration.known_scene import KnownScene
-from calibration.scenes.ground_depth import read_ground_depth
+from calibration.scenes.shadowneus import read_ground_depth
 from capture.checks.check_stack import check_and_register, register, white_balance_finding
 from capture.decode.formats import read_size
 from capture.errors import CaptureError
