@@ -28,6 +28,7 @@ from PIL import Image
 from calibration.calibrated_views import CalibratedViews, load_views, save_views
 from calibration.posed_camera import PosedCamera
 from capture.errors import CaptureError
+from capture.files.schema import read_kept
 from capture.files.title import hand_title_on
 from capture.photos.photo import read_thumbnail
 from capture.session.session import FEWEST_LIT
@@ -46,7 +47,7 @@ from reconstruct.run_folder.progress import Lazy, log_to, once
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.backend import backend_name, solver_device
 from reconstruct.source.calibrate_source import calibrate_source, in_millimetres, with_scale_of
-from reconstruct.source.photos import Photos, Plan, keep_spread, memory_plan, read_photos, read_plan
+from reconstruct.source.photos import Photos, Plan, keep_spread, memory_plan, read_photos
 from reconstruct.source.source import RunOptions, Source
 from reconstruct.stored_run.maps import THUMBS, thumbnail_name
 from reconstruct.stored_run.stored_run import CALIBRATION, FIELDS
@@ -193,7 +194,7 @@ def _fitting(options: RunOptions) -> str:
 
 def _plan(source: Source, options: RunOptions, run: RunFolder) -> Plan | None:
     """Return what fits into memory, decided once for all invocations of a run; None for a trained field."""
-    plan = read_plan(run.file(PLAN))
+    plan = read_kept(run.file(PLAN), Plan)
     if plan is None:
         plan = memory_plan(source, options)
         if plan is not None:

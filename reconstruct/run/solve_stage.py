@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 
+import msgspec
+
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
 from capture.errors import ReconstructionError, Remedy
@@ -19,7 +21,7 @@ from reconstruct.mesh.mesh import preview_mesh
 from reconstruct.mesh.texture import PhotoColours
 from reconstruct.run.machine import within_budget, work_of
 from reconstruct.run.object_poses_stage import forget_object_poses, joined_object_poses
-from reconstruct.run.presets import config_from_json, continued, solver_config, training
+from reconstruct.run.presets import continued, solver_config, training
 from reconstruct.run_folder.folder import KEPT, RunFolder
 from reconstruct.run_folder.progress import Lazy
 from reconstruct.run_folder.requests import (
@@ -204,7 +206,7 @@ def schedule(options: RunOptions, run: RunFolder, source: Source) -> tuple[str, 
         if kept and (options.time_budget is not None or resolution != options.preset):
             if resolution not in LONG_SIDES:
                 raise ValueError(f"the resolution {resolution!r}")
-            return resolution, config_from_json(kept)
+            return resolution, msgspec.convert(kept, FitConfig)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise ReconstructionError(
             f"{path} holds no settings of a solver ({why(error)}).", Remedy.START_AGAIN, Remedy.OTHER_FOLDER

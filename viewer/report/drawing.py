@@ -2,7 +2,6 @@
 
 import base64
 import io
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import cv2
@@ -20,13 +19,9 @@ Picture = UInt8[np.ndarray, "height width channels"]  # RGB, or RGBA where it ha
 JPEG_QUALITY = 86
 MARGIN = 1.04  # of a picture's sides over a mesh that just fits in
 OVERSAMPLING = 2  # a mesh is drawn this much larger, then averaged: smooth outlines
-SAMPLES_PER_PIXEL = 1.6  # along a triangle's longest edge, so that no pixel of it is missed
-LARGEST_BATCH = 2_000_000  # surface samples drawn at a time: about 200 MB
+FROM_AFAR = 1000.0  # heights of the picture between viewer and mesh: rays are parallel to a tenth of a pixel
 PLAIN = (190, 190, 196)  # of a mesh without colours
 KEY, FILL, RIM = 0.6, 0.26, 0.12  # light from upper left, from all around, and from above
-NEAR_TO_FAR = np.array(
-    [[253, 231, 137], [94, 201, 98], [33, 145, 140], [59, 82, 139], [68, 20, 84]], float
-)  # near to far
 DARKER, SAME, BRIGHTER = (52, 119, 219), (236, 236, 236), (226, 74, 51)  # of a difference
 STRONG_DIFFERENCE = 0.2  # of full sRGB scale: shown as full colour
 
@@ -73,9 +68,8 @@ def depth_picture(depth: Float[np.ndarray, "height width"], mask: Bool[np.ndarra
     out = np.zeros((*depth.shape, 4), np.uint8)
     if seen.any():
         near, far = depth[seen].min(), depth[seen].max()
-        at = (depth[seen] - near) / max(far - near, 1e-9) * (len(NEAR_TO_FAR) - 1)
-        stops = np.arange(len(NEAR_TO_FAR))
-        out[seen, :3] = np.stack([np.interp(at, stops, NEAR_TO_FAR[:, c]) for c in range(3)], -1)
+        level = np.round(255 * (far - depth[seen]) / max(far - near, 1e-9)).astype(np.uint8)
+        out[seen, :3] = cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS).reshape(-1, 3)[:, ::-1]
         out[seen, 3] = 255
     return out
 
@@ -118,16 +112,18 @@ def mesh_picture(mesh: "trimesh.Trimesh", back: Float[np.ndarray, "3"], size: tu
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
     axes = np.stack([right, -np.cross(back, right), -back])  # picture right, picture down, away
-    middle = mesh.bounds.mean(0)
-    seen = (mesh.vertices - middle) @ axes.T
+    seen = (mesh.vertices - mesh.bounds.mean(0)) @ axes.T
     scale = min(width / np.abs(seen[:, 0]).max(), height / np.abs(seen[:, 1]).max()) / (2 * MARGIN)
-    pixels = seen * scale + [width / 2, height / 2, 0]
-    colours = _vertex_light(mesh, axes)
-    depth = np.full(width * height, np.inf, np.float32)
-    picture = np.zeros((width * height, 4), np.float32)
-    for points, light in _surface_samples(pixels, colours, mesh.faces):
-        _draw_nearest(points, light, width, height, depth, picture)
-    blocks = cv2.resize(picture.reshape(height, width, 4), size, interpolation=cv2.INTER_AREA)  # means of whole blocks
+    away = FROM_AFAR * height
+    places = (seen * scale * [1, -1, -1] - [0, 0, away]).astype(np.float32)  # OpenGL's: up, towards the viewer
+    faces, light = np.asarray(mesh.faces, np.int32), _vertex_light(mesh, axes).astype(np.float32)
+    picture, depth = np.zeros((height, width, 3), np.float32), np.full((height, width), 2 * away, np.float32)
+    field = 2 * np.arctan(0.5 * height / away)
+    how = cv2.TriangleRasterizeSettings().setShadingType(cv2.RASTERIZE_SHADING_SHADED)
+    how = how.setCullingMode(cv2.RASTERIZE_CULLING_CW)
+    cv2.triangleRasterize(places, faces, light, picture, depth, np.eye(4), field, 0.5 * away, 2 * away, how)
+    drawn = np.dstack([picture, (depth < 2 * away).astype(np.float32)])
+    blocks = cv2.resize(drawn, size, interpolation=cv2.INTER_AREA)  # means of whole blocks
     cover = blocks[..., 3:]
     linear = np.divide(blocks[..., :3], cover, out=np.zeros_like(blocks[..., :3]), where=cover > 0)
     return np.concatenate([encode_srgb(linear), np.round(255 * cover).astype(np.uint8)], -1)
@@ -139,35 +135,3 @@ def _vertex_light(mesh: "trimesh.Trimesh", axes: Float[np.ndarray, "3 3"]) -> Fl
     key = np.array([-0.45, -0.6, -0.66]) @ axes  # picture left, up and near
     lit = KEY * np.clip(normals @ key, 0, 1) + FILL + RIM * np.clip(normals[:, 2], 0, 1)
     return decode_srgb(vertex_colours(mesh)) * lit[:, None]
-
-
-def _surface_samples(
-    pixels: Float[np.ndarray, "n 3"], colours: Float[np.ndarray, "n 3"], faces: np.ndarray
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Points on the triangles that face the viewer, dense enough to cover every pixel, with their colours."""
-    a, b, c = (pixels[faces[:, i]] for i in range(3))
-    turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    edge = np.max([np.abs(q - p)[:, :2].max(-1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-    steps = np.ceil(np.maximum(SAMPLES_PER_PIXEL * edge, 1)).astype(int)
-    for n in np.unique(steps):
-        i, j = np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij")
-        inside = (i + j) <= n
-        weights = np.stack([n - i - j, i, j], -1)[inside] / n
-        chosen = faces[(steps == n) & (turn < 0)]
-        batch = max(1, LARGEST_BATCH // len(weights))
-        for first in range(0, len(chosen), batch):
-            corners = chosen[first : first + batch]
-            yield (weights @ pixels[corners]).reshape(-1, 3), (weights @ colours[corners]).reshape(-1, 3)
-
-
-def _draw_nearest(
-    points: np.ndarray, light: np.ndarray, width: int, height: int, depth: np.ndarray, picture: np.ndarray
-) -> None:
-    """Keep, at each pixel, the sample nearest to the viewer. Changes depth and picture."""
-    u, v = np.floor(points[:, 0]).astype(int), np.floor(points[:, 1]).astype(int)
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    index, away = (v * width + u)[inside], points[inside, 2].astype(np.float32)
-    np.minimum.at(depth, index, away)
-    nearest = depth[index] == away
-    picture[index[nearest], :3] = light[inside][nearest]
-    picture[index[nearest], 3] = 1.0
