@@ -33,7 +33,7 @@ LOWEST = 0.02  # sine of a light's angle over the picture: below (1 degree) noth
 
 def _looking_down(width: int, height: int, focal: float) -> PosedCamera:
     """Return a camera that looks along -z at the origin from the height of its focal length; the ground is z = 0."""
-    camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
+    camera = Camera.centred(width, height, focal)
     return PosedCamera(camera, Pose(LOOKING_DOWN, np.array([0.0, 0.0, focal])), 0.0)
 
 

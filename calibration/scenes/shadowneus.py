@@ -20,8 +20,7 @@ from calibration.lights.known_ground import shading_misfit
 from calibration.lights.layouts import FROM_BLENDER, Floor, Frame, Frames
 from calibration.lights.power import with_common_power
 from calibration.pose import Pose
-from capture.decode.exr import exr_size, read_exr
-from capture.decode.formats import check_size
+from capture.decode.exr import read_exr
 from capture.errors import CalibrationError
 from capture.files.arrays import read_npy
 from capture.files.names import inside
@@ -68,11 +67,12 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
         CalibrationError: a file or field is missing or impossible; the message names both.
     """
     source = folder / f"transforms_{split}.json"
-    description = _described(source)
+    if not source.is_file():
+        others = ", ".join(sorted(p.name for p in folder.glob("transforms_*.json"))) or "no transforms_*.json"
+        raise CalibrationError(f"{source} does not exist; the folder has {others}.")
+    description = read_scene(source, _Description)
     frames = description.frames
-    pictures = [_picture_path(folder, frame, i, source) for i, frame in enumerate(frames)]
-    if len({p.name for p in pictures}) < len(pictures):
-        raise CalibrationError(f"{source}: two frames share the file name of their 'file_path'; give each its own.")
+    pictures = _pictures(frames, source)
     shadow_paths = _shadow_paths(pictures)
     usable = scene_photos(pictures, *([shadow_paths] if shadow_paths else []))
     every, pictures, kept = pictures, usable.paths, {path.name for path in usable.paths}
@@ -84,7 +84,8 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
             raise CalibrationError(f"{source}: shadow pictures of several lights at once; one light each is needed.")
         shadow_paths = None  # they do not show which of the lights is hidden
     stack = read_stack(pictures, PREVIEW_LONG_SIDE)
-    camera = _camera(description.camera_angle_x, stack.full_width, stack.full_height)
+    focal = stack.full_width / 2 / np.tan(description.camera_angle_x / 2)
+    camera = Camera.centred(stack.full_width, stack.full_height, focal)
     world_from_camera = _fixed_camera(frames, source)
     height = read_scene(folder / "transforms_floor.json", Floor).frames[0].transform_ground[2][3]
     if world_from_camera.translation[2] <= height:
@@ -111,16 +112,14 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
     )
 
 
-def _described(source: Path) -> _Description:
-    if not source.is_file():
-        others = ", ".join(sorted(p.name for p in source.parent.glob("transforms_*.json"))) or "no transforms_*.json"
-        raise CalibrationError(f"{source} does not exist; the folder has {others}.")
-    return read_scene(source, _Description)
-
-
-def _picture_path(folder: Path, frame: Frame, index: int, source: Path) -> Path:
-    name = frame.file_path
-    return inside(folder, name if name.endswith(".png") else name + ".png", f"{source}, frame {index}: 'file_path'")
+def _pictures(frames: Sequence[Frame], source: Path) -> list[Path]:
+    pictures = [
+        inside(source.parent, f"{frame.file_path.removesuffix('.png')}.png", f"{source}, frame {i}: 'file_path'")
+        for i, frame in enumerate(frames)
+    ]
+    if len({p.name for p in pictures}) < len(pictures):
+        raise CalibrationError(f"{source}: two frames share the file name of their 'file_path'; give each its own.")
+    return pictures
 
 
 def _shadow_paths(pictures: list[Path]) -> list[Path] | None:
@@ -141,11 +140,6 @@ def _is_shadow_picture(path: Path) -> bool:
     return bool(two_valued and np.allclose(rgb, grey[..., None], atol=0.005))
 
 
-def _camera(angle: float, width: int, height: int) -> Camera:
-    focal = width / 2 / np.tan(angle / 2)
-    return Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
-
-
 def _fixed_camera(frames: Sequence[Frame], source: Path) -> Pose:
     matrices = [np.array(frame.transform_matrix) for frame in frames]
     moved = [i for i, m in enumerate(matrices) if not np.allclose(m, matrices[0], atol=SAME_CAMERA_TOLERANCE)]
@@ -162,18 +156,17 @@ def _fixed_camera(frames: Sequence[Frame], source: Path) -> Pose:
 def _lights(frames: Sequence[Frame], pictures: list[Path], kind: str, height: float, source: Path) -> tuple[Light, ...]:
     lights = []
     for i, (frame, path) in enumerate(zip(frames, pictures, strict=True)):
-        where = f"{source}, frame {i}"
-        lights += [_light(matrix, path.name, kind, height, where) for matrix in np.array(frame.transform_matrix_sun)]
+        for matrix in np.array(frame.transform_matrix_sun):
+            place, towards = matrix[:3, 3], matrix[:3, 2]  # the light shines along its -z
+            if kind != "point":
+                length = max(float(np.linalg.norm(towards)), 1e-12)
+                lights.append(Light(path.name, kind, direction=towards / length))
+            elif place[2] > height:
+                lights.append(Light(path.name, kind, position=place))
+            else:
+                below = f"puts the light below the ground (z = {height:g})."
+                raise CalibrationError(f"{source}, frame {i}: 'transform_matrix_sun' {below}")
     return tuple(lights)
-
-
-def _light(matrix: Float[np.ndarray, "4 4"], photo: str, kind: str, height: float, where: str) -> Light:
-    place, towards = matrix[:3, 3], matrix[:3, 2]  # the light shines along its -z
-    if kind == "point" and place[2] - height <= 0:
-        raise CalibrationError(f"{where}: 'transform_matrix_sun' puts the light below the ground (z = {height:g}).")
-    if kind == "point":
-        return Light(photo, kind, position=place)
-    return Light(photo, kind, direction=towards / max(float(np.linalg.norm(towards)), 1e-12))
 
 
 IMPORTER = Importer("ShadowNeuS, rendered (transforms_*.json)", _recognised, load_known_scene)
@@ -196,7 +189,11 @@ def read_ground_depth(path: Path, camera: Camera) -> Float[np.ndarray, "height w
         CaptureError: not readable.
         CalibrationError: another size than the photos, or hardly any ground in it.
     """
-    depth = _read_exr(path) if path.suffix.lower() == ".exr" else read_npy(path, LARGEST_DEPTH)
+    if path.suffix.lower() == ".exr":
+        channels = read_exr(path)
+        depth = channels[next((n for n in ("Z", "R", "V", "Y", "B") if n in channels), min(channels))].astype(float)
+    else:
+        depth = read_npy(path, LARGEST_DEPTH)
     if depth.shape != (camera.height, camera.width):
         raise CalibrationError(
             f"{path} is {' x '.join(map(str, depth.shape[::-1]))}, {camera.width} x {camera.height} pixels as the "
@@ -209,10 +206,3 @@ def read_ground_depth(path: Path, camera: Camera) -> Float[np.ndarray, "height w
             "were needed. It must hold the z-depth of the bare ground in the unit of the scene."
         )
     return np.where(known, depth, np.nan)
-
-
-def _read_exr(path: Path) -> Float[np.ndarray, "..."]:
-    check_size(path, *exr_size(path))
-    channels = read_exr(path)
-    name = next((n for n in ("Z", "R", "V", "Y", "B") if n in channels), min(channels))
-    return channels[name].astype(float)

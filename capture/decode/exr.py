@@ -9,8 +9,8 @@ import numpy as np
 import OpenEXR
 from jaxtyping import Float
 
-from capture.decode.limits import broken
-from capture.decode.sandbox import Answer, decoding
+from capture.decode.limits import broken, check_size
+from capture.decode.sandbox import Answer, decoding, header_of
 
 MOST_PIXELS = 2**31  # beyond it a header is nonsense; readers allow far less
 
@@ -49,10 +49,11 @@ def read_exr(path: Path) -> dict[str, Float[np.ndarray, "height width"]]:
     """Return the channels of the first part, by name, float32, read-only.
 
     Raises:
-        CaptureError: no readable OpenEXR file.
+        CaptureError: no readable OpenEXR file, or larger than PIXEL_CAP.
     """
     with decoding(exr_picture, path, in_memory=True) as answer:
         header = _header(path, answer())
+        check_size(path, header.width, header.height)
         count = header.width * header.height
         found = answer(4 * count * len(header.names), count * len(header.names))
     if found is None or found.pixels is None or len(found.pixels) != len(found.names):
@@ -67,12 +68,10 @@ def colour_channels(channels: Mapping[str, Float[np.ndarray, "height width"]]) -
 
 
 def _header(path: Path, answer: Answer | None) -> ExrHeader:
-    if answer is None or len(answer.numbers) != 3:
-        raise broken(path, "no header")
-    width, height, parts = (int(number) for number in answer.numbers)
+    width, height, parts = header_of(path, answer, 3)
     if min(width, height) < 1 or width * height > MOST_PIXELS:
         raise broken(path, f"{width} x {height} pixels")
-    return ExrHeader(width, height, parts, answer.names)
+    return ExrHeader(width, height, parts, answer.names if answer else ())
 
 
 def exr_picture(file: BinaryIO) -> Iterator[Answer]:

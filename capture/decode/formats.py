@@ -276,7 +276,6 @@ def _tiff_size(path: Path) -> tuple[int, int]:
 
 def _decode_exr(path: Path) -> Float[np.ndarray, "height width 3"]:
     """Decode the colour. The values are linear: negative ones are noise and become 0."""
-    check_size(path, *exr_size(path))
     channels = read_exr(path)
     if (pixels := colour_channels(channels)) is None:
         raise CaptureError(

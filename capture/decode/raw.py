@@ -8,8 +8,8 @@ import numpy as np
 import rawpy
 from jaxtyping import Float
 
-from capture.decode.limits import broken, check_size, colour_of
-from capture.decode.sandbox import Answer, decoding
+from capture.decode.limits import check_size, colour_of
+from capture.decode.sandbox import Answer, decoding, header_of
 from capture.errors import CaptureError
 
 FULL = 65535  # the white level in 16 bits
@@ -23,7 +23,8 @@ def raw_size(path: Path) -> tuple[int, int]:
         CaptureError: the file is damaged, or its RAW format is unknown.
     """
     with decoding(raw_picture, path) as answer:
-        return _size(path, answer())
+        width, height = header_of(path, answer(), 2)
+    return width, height
 
 
 def read_raw(path: Path) -> Float[np.ndarray, "height width 3"]:
@@ -33,19 +34,13 @@ def read_raw(path: Path) -> Float[np.ndarray, "height width 3"]:
         CaptureError: as `raw_size`, or the picture is too large or empty.
     """
     with decoding(raw_picture, path) as answer:
-        width, height = _size(path, answer())
+        width, height = header_of(path, answer(), 2)
         check_size(path, width, height)
         found = answer(BYTES_PER_PIXEL * width * height, width * height)
     values = colour_of(path, found and found.pixels)
     if not values.any():
         raise CaptureError(f"{path} has no picture in it: every value is 0. Copy the RAW file again, or remove it.")
     return values / np.float32(FULL)
-
-
-def _size(path: Path, answer: Answer | None) -> tuple[int, int]:
-    if answer is None or len(answer.numbers) != 2:
-        raise broken(path, "no header")
-    return int(answer.numbers[0]), int(answer.numbers[1])
 
 
 def raw_picture(file: BinaryIO) -> Iterator[Answer]:

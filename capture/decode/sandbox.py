@@ -64,6 +64,17 @@ class Answer:
     pixels: Shaped[np.ndarray, "..."] | None = None
 
 
+def header_of(path: Path, answer: Answer | None, count: int) -> tuple[int, ...]:
+    """Return the `count` whole numbers of a task's first answer.
+
+    Raises:
+        CaptureError: it has none.
+    """
+    if answer is None or len(answer.numbers) != count:
+        raise broken(path, "no header")
+    return tuple(map(int, answer.numbers))
+
+
 Task = Callable[..., Iterator[Answer]]  # of a file that is open, and plain arguments
 Next = Callable[..., Answer | None]  # see `decoding`
 

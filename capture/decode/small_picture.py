@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from capture.decode.limits import broken, check_size, colour_of
-from capture.decode.sandbox import Answer, decoding
+from capture.decode.sandbox import Answer, decoding, header_of
 from capture.errors import CaptureError
 from capture.files.regular import open_regular, why
 
@@ -37,10 +37,7 @@ def read_small_picture(path: Path, most_pixels: int) -> UInt8[np.ndarray, "heigh
     except OSError as error:
         raise CaptureError(f"{path} cannot be read ({why(error)}). Make the result again.") from error
     with file, decoding(small_picture, path, opened=file) as answer:
-        header = answer()
-        if header is None or len(header.numbers) != 2:
-            raise broken(path, "no header")
-        width, height = (int(number) for number in header.numbers)
+        width, height = header_of(path, answer(), 2)
         check_size(path, width, height)
         if width * height > most_pixels:
             size = f"{width} x {height} pixels, at most {most_pixels:,} pixels were needed"

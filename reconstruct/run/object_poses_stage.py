@@ -6,6 +6,7 @@ from itertools import count
 import torch
 
 from capture.errors import ReconstructionError
+from capture.files.atomic import atomic_file
 from reconstruct.config import FitConfig
 from reconstruct.fields import SolvedScene, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh
@@ -102,7 +103,7 @@ class _SmallSolves:
         for name, sentence in together.refused:
             refused.append((name, f"{sentence} What it shows is left out; its own surface is in {name}/{NOT_JOINED}."))
             alone = next(one.fields for one in solved if one.name == name)
-            with self.run.writing(f"{name}/{NOT_JOINED}") as mesh:
+            with atomic_file(self.run.file(f"{name}/{NOT_JOINED}")) as mesh:
                 extract_mesh(alone).export(mesh, file_type="ply")
         for _, sentence in refused:
             self.run.progress(message=sentence)

@@ -28,6 +28,7 @@ from PIL import Image
 from calibration.calibrated_views import CalibratedViews, load_views, save_views
 from calibration.posed_camera import PosedCamera
 from capture.errors import CaptureError
+from capture.files.atomic import atomic_file
 from capture.files.schema import read_kept
 from capture.files.title import hand_title_on
 from capture.photos.photo import read_thumbnail
@@ -251,7 +252,7 @@ def write_thumbnails(source: Source, run: RunFolder, first: str | None = None) -
     for view in source.views():
         before = "" if view.name == first else f"{view.name}/"
         for photo in view.photos():
-            with run.writing(f"{THUMBS}/{thumbnail_name(before + photo.name)}") as path:
+            with atomic_file(run.file(f"{THUMBS}/{thumbnail_name(before + photo.name)}")) as path:
                 Image.fromarray(read_thumbnail(photo, THUMBNAIL_LONG_SIDE)).save(path, quality=THUMBNAIL_QUALITY)
 
 

@@ -13,7 +13,7 @@ import msgspec
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
 from capture.errors import ReconstructionError, Remedy
-from capture.files.atomic import read_json
+from capture.files.atomic import atomic_file, read_json
 from capture.files.regular import why
 from reconstruct.config import FitConfig
 from reconstruct.fields import SolvedScene
@@ -70,7 +70,7 @@ class RequestSteering:
         self._run.activity("")
         while PAUSE in (asked := open_requests(self._run.path)) and STOP not in asked:
             time.sleep(LOOK_EVERY_S)
-        self._run.idle(time.monotonic() - start)
+        self._run.idle_s += time.monotonic() - start
         self._run.remark("going on")
 
     def is_stopped(self) -> bool:
@@ -170,7 +170,7 @@ def solve(
         save_state(solved.state, json.dumps(asdict(solved.config)), run.file(EARLIER))  # the change takes effect
         run.write_json("config.json", asdict(solved.config) | {RESOLUTION: solved.resolution})  # with this file
     if steering.was_stopped:
-        run.leave_open()
+        run.is_left_open = True
     else:
         forget_object_poses(run)
     run.reopen("mesh", "detail")  # of a surface that was stopped earlier
@@ -229,7 +229,7 @@ def _reporter(run: RunFolder, scene: Scene) -> SolveReporter:
         mesh = None if surface is None else preview_mesh(surface, scene.ground_height)
         mesh = None if mesh is None else colours.get().coloured(mesh)
         if mesh is not None and stage == "hull":
-            with run.writing("hull.ply") as path:
+            with atomic_file(run.file("hull.ply")) as path:
                 mesh.export(path)
         run.progress(stage, done, total, message, losses, mesh)
 

@@ -125,7 +125,9 @@ def make_train_pixels(scene: Scene, frame: UnitFrame, divisor: int, device: torc
     mask = Observer(small).ground_labels().mask
     reach = max(1, round(mask.shape[0] / ROUGH))
     wide = max_pool2d((mask > 0.5).float()[None], 2 * reach + 1, 1, reach)[0] > 0
-    unit = _on(in_unit_frame(small, frame), device)
+    unit = in_unit_frame(small, frame)
+    tensors = {f.name: value for f in fields(unit) if isinstance(value := getattr(unit, f.name), Tensor)}
+    unit = replace(unit, **{name: value.to(device) for name, value in tensors.items()})
     t = torch.linalg.vector_norm(ground_points(unit) - unit.eye, dim=-1)
     return TrainPixels(
         scene=unit,
@@ -146,8 +148,3 @@ def draw(view: TrainPixels, pixels: int, lights: int, generator: torch.Generator
     lit = torch.randperm(photos, generator=generator)[:lights].to(device)
     rays = CameraRays(view.scene.eye, view.directions[drawn], view.ground_t[drawn], view.scene.pixel_angle)
     return Batch(rays, drawn, lit, view.is_object[drawn])
-
-
-def _on(scene: Scene, device: torch.device) -> Scene:
-    tensors = {f.name: getattr(scene, f.name) for f in fields(scene)}
-    return replace(scene, **{name: v.to(device) for name, v in tensors.items() if isinstance(v, Tensor)})

@@ -156,16 +156,6 @@ def smooth_l1(error: Float[Tensor, "*batch"], weights: Float[Tensor, "*batch"]) 
     return (each * weights).sum() / weights.sum().clamp(min=1e-5)
 
 
-def colour_loss(error: Float[Tensor, "photos pixels 3"], weights: Float[Tensor, "photos pixels"]) -> Float[Tensor, ""]:
-    """Return the smooth L1 norm, summed over channels, averaged over pixels and lights [ShadowNeuS eq:loss_rgb]."""
-    return 3 * smooth_l1(error, weights[..., None].expand_as(error))
-
-
-def eikonal_loss(field: SdfField, points: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
-    """Return the mean of (|grad f| - 1)^2 at points [ShadowNeuS, "Training"]."""
-    return ((torch.linalg.vector_norm(field.gradient(points.detach()), dim=-1) - 1) ** 2).mean()
-
-
 def _zero_where(field: SdfField, points: Float[Tensor, "n 3"], wrong_sign: float) -> tuple[Tensor, Tensor]:
     """Return a loss that brings the SDF to zero where it has the wrong sign, and those points."""
     sdf = field.sdf(points)
@@ -249,7 +239,8 @@ def losses(
     terms = {}
     if view.colour is not None:
         error = blended(colours(model, seen, lit, view.scene.ambient), seen) - view.colour[batch.photos][:, pixels]
-        terms["colour"] = weights.colour * colour_loss(error, share)
+        of_pixels = smooth_l1(error, share[..., None].expand_as(error))
+        terms["colour"] = weights.colour * (3 * of_pixels)  # summed over channels [ShadowNeuS eq:loss_rgb]
     if view.shadow is not None:
         error = blended(lit.visibility, seen) - view.shadow[batch.photos][:, pixels]
         terms["shadow"] = weights.visibility * smooth_l1(error, share)
@@ -261,7 +252,8 @@ def losses(
     terms |= {"bound": weights.bound * bound, "contain": held * contain}
     points = _eikonal_points(seen, lit, config, generator)
     points = torch.cat([points, outside.detach(), about.detach()])
-    return terms | {"eikonal": weights.eikonal * eikonal_loss(field, points)}
+    slope = torch.linalg.vector_norm(field.gradient(points.detach()), dim=-1)
+    return terms | {"eikonal": weights.eikonal * ((slope - 1) ** 2).mean()}
 
 
 def _eikonal_points(

@@ -175,7 +175,8 @@ def iterations(
         terms = losses(model, view, config, i, generator)
         optimiser.zero_grad(set_to_none=True)
         torch.stack(list(terms.values())).sum().backward()
-        failures = 0 if _is_finite(model) else failures + 1
+        gradients = [p.grad.abs().sum() for p in model.parameters() if p.grad is not None]
+        failures = 0 if bool(torch.stack(gradients).isfinite().all()) else failures + 1
         if not failures:
             optimiser.step()
         else:
@@ -225,8 +226,3 @@ def _albedo(model: Model, view: TrainPixels, config: TrainConfig) -> Float[Tenso
         albedo, _ = model.materials(points, normals, model.field.features(points))
         out.append(torch.where(hits.t.isfinite()[:, None], albedo, 0.0).cpu())
     return torch.cat(out).reshape(*view.scene.directions.shape[:2], 3)
-
-
-def _is_finite(model: Model) -> bool:
-    gradients = [p.grad for p in model.parameters() if p.grad is not None]
-    return bool(torch.stack([g.abs().sum() for g in gradients]).isfinite().all())

@@ -53,18 +53,13 @@ def in_millimetres(fields: SolvedScene, length: float, ground_is_known: bool) ->
 
 def with_scale_of(calibration: Calibration, fields: SolvedScene, length: float, ground_is_known: bool) -> Calibration:
     """Return the calibration in the unit of a scaled scene, whose camera is the same, with a note on the length."""
-    factor = _height(fields.world_from_camera.translation, fields.ground_height) / _height(
-        calibration.world_from_camera.translation, calibration.ground_height
-    )
+    now, before = (float(x.world_from_camera.translation[2]) - x.ground_height for x in (fields, calibration))
+    factor = now / before
     scaled = calibration.scaled(factor, fields.unit)
     what = "height above the ground" if ground_is_known else "largest extent across the picture"
     note = f"scale: the object's {what} is {length:g} mm, as given; one unit of the files was {factor:.4g} mm"
     notes = [text for text in scaled.residuals.get("notes", []) if not text.startswith(UNKNOWN_SCALE)]
     return replace(scaled, residuals=scaled.residuals | {"notes": [*notes, note]})
-
-
-def _height(place: np.ndarray, ground: float) -> float:
-    return float(place[2]) - ground
 
 
 def calibrate_source(source: Source, photos: Sequence[Photos], options: RunOptions) -> CalibratedViews:
