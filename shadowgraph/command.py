@@ -116,7 +116,7 @@ def _import(command: Import, console: Console) -> None:
 
 def _evaluate(command: Evaluate, console: Console) -> None:
     from reconstruct.evaluate.metrics import evaluate
-    from reconstruct.stored_run.refusal import refuse_no_run
+    from reconstruct.stored_run.documents import refuse_no_run
 
     refuse_no_run(command.run)
     refuse_no_folder(command.reference, "the folder that holds the truth")
@@ -131,7 +131,7 @@ def _report(command: Report, console: Console) -> None:
         names = write_bundle(command.run, command.bundle, command.with_pictures)
         line = f"{command.bundle} written: {', '.join(names)}. Look into it before you send it."
     else:
-        from reconstruct.stored_run.refusal import refuse_no_run
+        from reconstruct.stored_run.documents import refuse_no_run
         from viewer.report.report import write_report
 
         refuse_no_run(command.run)

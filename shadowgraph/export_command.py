@@ -15,7 +15,7 @@ from capture.errors import CaptureError
 from reconstruct.export.export import ExportOptions, OnProgress, format_for, save
 from reconstruct.export.export import export as export_run
 from reconstruct.run_folder.folder import Progress as Step
-from reconstruct.stored_run.refusal import refuse_no_run
+from reconstruct.stored_run.documents import refuse_no_run
 from shadowgraph.options import Command, Given, ResultFolder
 from shadowgraph.terminal import Display, print_lines
 from viewer.stage.page import FORMATS

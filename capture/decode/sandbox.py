@@ -51,7 +51,7 @@ LARGEST_MESSAGE = 1 << 16  # bytes
 MOST_NUMBERS, MOST_NAMES, LONGEST_NAME = 16, 64, 255
 SAMPLES = {"uint8", "uint16", "float32"}
 # modules that tasks may come from
-MODULES = tuple(f"capture.decode.{name}" for name in ("heif", "raw", "exr", "tiff", "video", "small_picture"))
+MODULES = tuple(f"capture.decode.{name}" for name in ("heif", "exr", "pictures", "video"))
 DAMAGED = (OSError, SyntaxError, ValueError, EOFError, RuntimeError, TypeError, cv2.error, rawpy.LibRawError)
 
 

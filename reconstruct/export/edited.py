@@ -202,16 +202,11 @@ def edited_surface(run: StoredRun) -> EditedSurface:
     Raises:
         UserError: a file of the run cannot be used, or nothing is left of the object.
     """
-    edit = _edit_of(run)
+    document, edit = read_stage_document(run.run_dir), Edit()
+    if document is not None:
+        low, high = (tuple(document["crop"][end]) for end in ("low", "high")) if document["crop"] else (None, None)
+        edit = Edit(low, high, float(document["smooth"]), document["guess"] == "cut")
     if edit.low is None and not edit.smooth:
         return EditedSurface(run, run.mesh, edit)
     fields = edited_fields(run.fields, edit)
     return EditedSurface(run, edited_mesh(fields, run.mesh, edit), edit, fields)
-
-
-def _edit_of(run: StoredRun) -> Edit:
-    document = read_stage_document(run.run_dir)
-    if document is None:
-        return Edit()
-    low, high = (tuple(document["crop"][end]) for end in ("low", "high")) if document["crop"] else (None, None)
-    return Edit(low, high, float(document["smooth"]), document["guess"] == "cut")

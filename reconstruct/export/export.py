@@ -38,7 +38,7 @@ class Format:
 _FACES, _PRINTED, _SKINNED = ("faces",), ("faces", "print_size"), ("faces", "texture")
 _LOOK, _MOVES = ("width", "lamp_size"), ("width", "frames", "lamp_size")
 _MESH, _MAPS = "reconstruct.export.meshes", "reconstruct.export.maps"
-_FILM, _DATA = "reconstruct.export.film", "reconstruct.export.datasets"
+_FILM, _DATA = "reconstruct.export.relit", "reconstruct.export.datasets"
 _VIDEO, _FOLDER = (".webm", ".gif"), ("",)
 FORMATS: dict[str, Format] = {
     "glb": Format(

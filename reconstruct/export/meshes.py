@@ -19,6 +19,7 @@ from reconstruct.export.export import Contents, ExportOptions, OnProgress
 from reconstruct.mesh.glb import Y_UP, metres
 from reconstruct.mesh.texture import TexturedMesh, bake, size_for, write_textured_glb
 from reconstruct.stored_run.ply import LARGEST_FILE
+from reconstruct.stored_run.stage_pack import ZIP_TIME
 from reconstruct.stored_run.stored_run import MESH, StoredRun
 
 FACES = 30_000  # unless another number is asked for: any phone turns it smoothly, and the normal map keeps what is lost
@@ -31,7 +32,6 @@ CORE_3MF = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
 RELATIONS = "http://schemas.openxmlformats.org/package/2006/relationships"
 CONTENT_TYPES = "http://schemas.openxmlformats.org/package/2006/content-types"
 MODEL_PART = "3D/3dmodel.model"
-ZIP_TIME = (1980, 1, 1, 0, 0, 0)  # the same run gives the same bytes
 SMALLEST_PRINT, LARGEST_PRINT = 1.0, 10_000.0  # mm, of the longest side
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from calibration.light import Light
 from calibration.posed_camera import PosedCamera
-from capture.photos.photo import decode_srgb, encode_srgb
+from capture.photos.photo import decode_srgb, encode_srgb, smaller
 from reconstruct.detail.file import SURE, UNIT, Detail
 from reconstruct.fields import SolvedScene
 from reconstruct.mesh.evidence import SEEN
@@ -166,7 +166,7 @@ def _object_pictures(
     bottom, right = min(int(rows[-1]) + MARGIN + 1, height), min(int(columns[-1]) + MARGIN + 1, width)
     cut = np.s_[top:bottom, left:right]
     inner = np.asarray(binary_erosion(mask, border_value=1), bool)
-    picture = _small(filled(fields.albedo.numpy()[cut], (inner if inner.any() else mask)[cut]))
+    picture = smaller(filled(fields.albedo.numpy()[cut], (inner if inner.any() else mask)[cut]), PICTURE_SIDE)
     return encode_srgb(picture), (left / width, top / height, (right - left) / width, (bottom - top) / height), None
 
 
@@ -194,15 +194,7 @@ def ground_pictures(
     hidden = np.asarray(binary_dilation(~ground, iterations=2), bool)
     known = ~hidden if (~hidden).any() else ground
     picture = filled(albedo, known) if known.any() else np.broadcast_to(mean, albedo.shape)
-    return encode_srgb(_small(np.ascontiguousarray(picture))), encode_srgb(mean)
-
-
-def _small(picture: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "rows columns 3"]:
-    shrink = PICTURE_SIDE / max(picture.shape[:2])
-    if shrink >= 1:
-        return picture
-    size = max(1, round(picture.shape[1] * shrink)), max(1, round(picture.shape[0] * shrink))
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    return encode_srgb(smaller(np.ascontiguousarray(picture), PICTURE_SIDE)), encode_srgb(mean)
 
 
 class FirstView:

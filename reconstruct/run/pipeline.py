@@ -32,7 +32,6 @@ from capture.files.atomic import atomic_file
 from capture.files.schema import read_kept
 from capture.files.title import hand_title_on
 from capture.photos.photo import read_thumbnail
-from capture.session.session import FEWEST_LIT
 from reconstruct.check.readiness import refuse_hopeless
 from reconstruct.check.verdict import check_capture
 from reconstruct.fields import SolvedScene, load_fields, save_fields
@@ -48,7 +47,7 @@ from reconstruct.run_folder.progress import Lazy, log_to, once
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.backend import backend_name, solver_device
 from reconstruct.source.calibrate_source import calibrate_source, in_millimetres, with_scale_of
-from reconstruct.source.photos import Photos, Plan, keep_spread, memory_plan, read_photos
+from reconstruct.source.photos import Photos, Plan, memory_plan, read_photos, within_plan
 from reconstruct.source.source import RunOptions, Source
 from reconstruct.stored_run.maps import THUMBS, thumbnail_name
 from reconstruct.stored_run.stored_run import CALIBRATION, FIELDS
@@ -92,7 +91,10 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
         return
     if source.session is not None and source.ground_is_known(options) and not run.is_finished("solve"):
         once(run, "check", "judging the photos", lambda: _check(source, photos.get(), calibrated.get(), run), photos)
-    once(run, "solve", _fitting(options), fit, photos, FIELDS)
+    compiling = "" if kernels_are_compiled() else "; the first run on a machine takes some 20 s longer"
+    what = "training a field" if options.is_trained() else "fitting the surface"
+    message = f"{what} on {backend_name(solver_device(options.device))}{compiling}"
+    once(run, "solve", message, fit, photos, FIELDS)
     if source.scale(options) is not None and run.is_finished("solve"):
         _keep_scale(source, options, run, calibrated.get(), fields.get())
     calibrated.forget()  # the memory plan may have left out photos
@@ -186,13 +188,6 @@ def _keep_scale(
         save_views(calibrated.with_calibrations(scaled), run.file(CALIBRATION))
 
 
-def _fitting(options: RunOptions) -> str:
-    """Return the progress message of the stage "solve"."""
-    compiling = "" if kernels_are_compiled() else "; the first run on a machine takes some 20 s longer"
-    where = backend_name(solver_device(options.device))
-    return f"{'training a field' if options.is_trained() else 'fitting the surface'} on {where}{compiling}"
-
-
 def _plan(source: Source, options: RunOptions, run: RunFolder) -> Plan | None:
     """Return what fits into memory, decided once for all invocations of a run; None for a trained field."""
     plan = read_kept(run.file(PLAN), Plan)
@@ -209,8 +204,7 @@ def _within_memory(source: Source, options: RunOptions, run: RunFolder, calibrat
     if plan is None:
         return calibrated
     before, every = [view.calibration for view in calibrated.views], len(source.photos())
-    most = [plan.photos if len(before) == 1 else plan.photos * len(one.lights) // every for one in before]
-    thinned = [keep_spread(one, max(count, FEWEST_LIT)) for one, count in zip(before, most, strict=True)]
+    thinned = [within_plan(one, plan, every) for one in before]
     used = [[light.used for one in some for light in one.lights] for some in (before, thinned)]
     if used[0] == used[1]:
         return calibrated

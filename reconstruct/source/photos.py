@@ -25,7 +25,7 @@ from capture.errors import CaptureError
 from capture.photos.finding import Finding, keep_findings, kept_findings
 from capture.photos.photo import PhotoStack, read_alpha, read_grey, read_stack
 from capture.photos.radiometry import with_one_white_balance, without_ambient
-from capture.session.session import Session
+from capture.session.session import FEWEST_LIT, Session
 from reconstruct.labels.outline import bright_object
 from reconstruct.run_folder.forecast import memory_room
 from reconstruct.source.source import AUTO, CALIBRATION_LONG_SIDE, LONG_SIDES, RunOptions, Source
@@ -123,6 +123,12 @@ def keep_spread(calibration: Calibration, count: int) -> Calibration:
         kept = {names[i] for i in chosen}
         lights = [replace(x, used=False, reason=TOO_MANY) if x.used and x.photo not in kept else x for x in lights]
     return replace(calibration, lights=tuple(lights))
+
+
+def within_plan(calibration: Calibration, plan: Plan, every: int) -> Calibration:
+    """Return the calibration of a view with its share of the photos that fit in use, of `every` photo of all views."""
+    share = max(FEWEST_LIT, plan.photos * len(calibration.lights) // every)
+    return keep_spread(calibration, min(share, plan.photos))
 
 
 @dataclass(frozen=True)

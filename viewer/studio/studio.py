@@ -96,7 +96,7 @@ class Studio:
             deleted = [asdict(one) for one in self.trash.list()]
             return {
                 "folder": str(self.folder.root),
-                "free": self.folder.free_bytes(),
+                "free": shutil.disk_usage(self.folder.root).free,
                 "keep_free": KEEP_FREE,
                 "cards": cards,
                 "queue": [self._queued(job, rows.get(self.folder.key(job.run))) for job in jobs],
