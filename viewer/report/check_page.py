@@ -14,7 +14,7 @@ from capture.photos.photo import encode_srgb, read_photo
 from reconstruct.check.light_coverage import ShadowCover, side_in_words
 from reconstruct.check.verdict import CaptureCheck
 from viewer.report import document as doc
-from viewer.report.drawing import enlarged
+from viewer.report.document import enlarged
 from viewer.report.figures import coverage, lights_from_above
 
 PAGE = "check.html"

@@ -19,8 +19,7 @@ from reconstruct.export.export import FORMATS, UNIT_WORDS, Contents, ExportOptio
 from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
 from reconstruct.stored_run.stage_pack import STAGE_PACK, StagePack, addressed, marks_of, read_stage_pack
 from reconstruct.stored_run.stored_run import FIELDS, MESH, StoredRun
-from viewer.report.document import hash_of
-from viewer.report.drawing import as_address
+from viewer.report.document import as_address, hash_of
 
 SCRIPTS = (
     "vectors",

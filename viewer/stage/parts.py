@@ -13,7 +13,7 @@ from reconstruct.render.studio import Studio, studio_of
 from reconstruct.stored_run.maps import read_thumbnails
 from reconstruct.stored_run.stage_pack import stage_archive
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.report.drawing import jpeg
+from viewer.report.document import jpeg
 from viewer.stage.facts import BACKGROUND, first_window, home_pose, lit_photos, stage_facts
 
 QUALITY, NORMAL_QUALITY, PHOTO_QUALITY = 90, 95, 82  # JPEG
