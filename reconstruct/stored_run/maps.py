@@ -41,7 +41,7 @@ def read_maps(folder: Path, size: tuple[int, int] | None = None) -> Maps:
     Raises:
         UserError: one is missing or damaged, or they are of other sizes.
     """
-    depth, normals = read_depth(folder / DEPTH), read_normals(folder / NORMALS)
+    depth, normals = _numbers(folder / DEPTH, ()), _numbers(folder / NORMALS, (3,))
     mask = read_mask(folder / MASK)
     sizes = (depth.shape, normals.shape[:2], mask.shape)
     wanted = mask.shape if size is None else size
@@ -50,7 +50,7 @@ def read_maps(folder: Path, size: tuple[int, int] | None = None) -> Maps:
             f"{DEPTH}, {NORMALS} and {MASK} in {folder} are {sizes[0]}, {sizes[1]} and {sizes[2]} pixels (rows, "
             f"columns), {wanted} were needed. They have to be of the same photos."
         )
-    return Maps(depth, normals, mask)
+    return Maps(_depths(depth, folder / DEPTH), _directions(normals, folder / NORMALS), mask)
 
 
 def read_depth(path: Path) -> Float32[np.ndarray, "height width"]:
@@ -59,11 +59,7 @@ def read_depth(path: Path) -> Float32[np.ndarray, "height width"]:
     Raises:
         ReconstructionError: it cannot be read, or holds something else than depths.
     """
-    depth = _numbers(path, ())
-    seen = depth[depth != np.inf]
-    if not (seen.min(initial=1) > 0 and seen.max(initial=1) <= LARGEST_DEPTH):  # false of NaN, too
-        raise refusal(path, "it holds something else than depths: positive numbers, or inf where no object is seen")
-    return depth
+    return _depths(_numbers(path, ()), path)
 
 
 def read_normals(path: Path) -> Float32[np.ndarray, "height width 3"]:
@@ -72,7 +68,17 @@ def read_normals(path: Path) -> Float32[np.ndarray, "height width 3"]:
     Raises:
         ReconstructionError: it cannot be read, or holds something else than normals.
     """
-    normals = _numbers(path, (3,))
+    return _directions(_numbers(path, (3,)), path)
+
+
+def _depths(depth: np.ndarray, path: Path) -> Float32[np.ndarray, "height width"]:
+    seen = depth[depth != np.inf]
+    if not (seen.min(initial=1) > 0 and seen.max(initial=1) <= LARGEST_DEPTH):  # false of NaN, too
+        raise refusal(path, "it holds something else than depths: positive numbers, or inf where no object is seen")
+    return depth
+
+
+def _directions(normals: np.ndarray, path: Path) -> Float32[np.ndarray, "height width 3"]:
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.sqrt(np.einsum("hwc,hwc->hw", normals, normals))
     if not ((length == 0) | (np.abs(length - 1) <= NORMAL_ATOL)).all():
