@@ -9,7 +9,7 @@ from pathlib import Path
 from reconstruct.stored_run.stage_pack import stage_archive
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.stage.parts import facts_and_parts
-from viewer.studio.example import RESULT
+from viewer.studio.library import RESULT
 
 
 def main() -> None:

@@ -37,7 +37,7 @@ import damaged_runs  # pyright: ignore[reportMissingImports]
 from numba.core.registry import cpu_target
 
 import reconstruct.evaluate.metrics
-import viewer.report.drawing
+import viewer.report.document
 from calibration.calibration import load_calibration
 from capture.errors import UserError
 from reconstruct.appearance.brdf import facing_reflectances
@@ -278,7 +278,7 @@ def warm_up(work: Path) -> None:
 
 def lighten() -> None:
     """Small pictures and few samples: what a command computes from a run that was read is not what is tried here."""
-    viewer.report.drawing.OVERSAMPLING = 1
+    viewer.report.document.OVERSAMPLING = 1
     reconstruct.evaluate.metrics.SCENE_SAMPLES = reconstruct.evaluate.metrics.CAPTURE_SAMPLES = FEW_SAMPLES
     facing_reflectances()  # a table that every process would make for itself
 

@@ -261,15 +261,7 @@ def refuse_other_size(camera: Camera, stack: PhotoStack) -> None:
 def _unknown_light(name: str, reason: str, fit: LightFit) -> Light:
     """Return the light of a photo that was left out: amid the others, with their spread as uncertainty."""
     places = np.array([light.homogeneous()[:3] for light in fit.lights])
+    about = {"power": np.zeros(3), "sigma": places.std(axis=0), "used": False, "reason": reason}
     if fit.lights[0].position is None:
-        up, wide = np.array([0.0, 0.0, 1.0]), places.std(axis=0)
-        return Light(name, "directional", direction=up, power=np.zeros(3), sigma=wide, used=False, reason=reason)
-    return Light(
-        name,
-        "point",
-        position=np.median(places, axis=0),
-        power=np.zeros(3),
-        sigma=places.std(axis=0),
-        used=False,
-        reason=reason,
-    )
+        return Light(name, "directional", direction=np.array([0.0, 0.0, 1.0]), **about)
+    return Light(name, "point", position=np.median(places, axis=0), **about)

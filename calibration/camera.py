@@ -51,6 +51,11 @@ class Camera:
         if max(abs(self.cx), abs(self.cy)) > LARGEST_FOCAL * longer:
             raise refused("cx", self.cx, "a principal point near the picture, as cy")
 
+    @staticmethod
+    def centred(width: int, height: int, focal: float) -> "Camera":
+        """Return a camera without distortion whose axis meets the middle of the picture; focal length in px."""
+        return Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
+
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         """Return OpenCV's camera matrix K, px."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
@@ -67,13 +72,13 @@ class Camera:
             return pixels.reshape(*points.shape[:-1], 2)
         xy = flat[:, :2] / np.where(flat[:, 2:] == 0, 1.0, flat[:, 2:])  # as OpenCV has it
         if any(self.distortion):
-            outside = np.maximum(np.hypot(*xy.T) * np.sign(flat[:, 2]) / self._field, 1.0)[:, None]
+            outside = np.maximum(np.hypot(*xy.T) * np.sign(flat[:, 2]) / self.field, 1.0)[:, None]
             xy = _distorted(xy / outside, self.distortion) * outside
         pixels = xy * [self.fx, self.fy] + [self.cx, self.cy]
         return pixels.reshape(*points.shape[:-1], 2)
 
     @cached_property
-    def _field(self) -> float:
+    def field(self) -> float:
         """Tangent of the largest angle from the axis for which the distortion is known, with a margin."""
         right, low = self.width - 1.0, self.height - 1.0
         corners = self.unproject(np.array([[0.0, 0.0], [right, 0.0], [0.0, low], [right, low]]))

@@ -18,7 +18,7 @@ class KnownScene:
     mask_path: Path | None  # its alpha channel is the object's coverage
     mask_is_grey: bool = False  # its brightness is
     ground_known: bool = True  # False: calibration.ground_height is an assumption
-    ground_depth_path: Path | None = None  # of uneven ground, see calibration.scenes.ground_depth
+    ground_depth_path: Path | None = None  # of uneven ground, see calibration.scenes.shadowneus
     is_linear: bool = False  # the numbers in 8 and 16-bit photos are linear, not sRGB-encoded
     left_out: tuple[float, float, float] | None = (
         None  # x, y, radius (px) of what is no object: a ball that shows light

@@ -22,7 +22,7 @@ from playwright.sync_api import Page as Tab
 from playwright.sync_api import sync_playwright
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from capture.session.skipped import photos_of
+from capture.session.sorting import photos_of
 from reconstruct.render.studio import studio_of
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.stage.facts import home_pose

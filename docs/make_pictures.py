@@ -31,7 +31,7 @@ from reconstruct.run.solve_stage import prepare_scene
 from reconstruct.source.photos import read_photos
 from reconstruct.source.source import RunOptions, open_source
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.report.drawing import depth_picture, mesh_picture, normal_picture
+from viewer.report.document import depth_picture, mesh_picture, normal_picture
 
 PICTURES = Path(__file__).parent / "pictures"
 HEIGHT = 300  # px of every panel

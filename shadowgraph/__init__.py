@@ -7,11 +7,15 @@ A name is imported from its module when it is first asked for.
 """
 
 import importlib
+import os
 from typing import Any
 
-from shadowgraph.threads import wait_asleep
-
-wait_asleep()  # before any other package loads numpy or torch
+# Threads of OpenMP (torch, numba) sleep between two parts of work. On a busy machine their loops took 5 to 10 times the
+# CPU time of the work itself. OpenBLAS gets one thread: our matrices are small, and its second thread waits in a loop.
+# Both read the environment once, when they are loaded, and so do processes started here; what the user set stays.
+WAITING = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1"}
+for _name, _value in WAITING.items():
+    os.environ.setdefault(_name, _value)
 
 FACADE = {
     "run": "shadowgraph.api",

@@ -10,9 +10,7 @@ import json
 import os
 import signal
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, NamedTuple
@@ -26,7 +24,7 @@ from shadowgraph.export_command import Export, Relight, export, relight
 from shadowgraph.options import Calibrate, Check, Doctor, Evaluate, Import, PrintBoard, Reconstruct, Report, Run, View
 from shadowgraph.run_command import Batch, batch, check, folder_name, run_stages
 from shadowgraph.studio_command import Studio, Watch, studio, watch
-from shadowgraph.terminal import print_lines
+from shadowgraph.terminal import on_signal, print_lines
 
 OPTIONS = {
     Remedy.NAME_BOARD: "--board",
@@ -45,21 +43,8 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM arrived. It ends a command as Ctrl-C does; the last state is saved."""
 
 
-@contextmanager
-def sigterm_as_ctrl_c() -> Iterator[None]:
-    """Raise Terminated on SIGTERM while the block runs. In a thread that is not the main one it changes nothing."""
-
-    def stop(_number: int, _frame: FrameType | None) -> None:
-        raise Terminated
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+def _stop(_number: int, _frame: FrameType | None) -> None:
+    raise Terminated
 
 
 def _is_out_of_memory(error: Exception) -> bool:
@@ -131,7 +116,7 @@ def _import(command: Import, console: Console) -> None:
 
 def _evaluate(command: Evaluate, console: Console) -> None:
     from reconstruct.evaluate.metrics import evaluate
-    from reconstruct.stored_run.refusal import refuse_no_run
+    from reconstruct.stored_run.documents import refuse_no_run
 
     refuse_no_run(command.run)
     refuse_no_folder(command.reference, "the folder that holds the truth")
@@ -146,7 +131,7 @@ def _report(command: Report, console: Console) -> None:
         names = write_bundle(command.run, command.bundle, command.with_pictures)
         line = f"{command.bundle} written: {', '.join(names)}. Look into it before you send it."
     else:
-        from reconstruct.stored_run.refusal import refuse_no_run
+        from reconstruct.stored_run.documents import refuse_no_run
         from viewer.report.report import write_report
 
         refuse_no_run(command.run)
@@ -241,7 +226,7 @@ def main(arguments: list[str] | None = None) -> int:
     if not command.debug:
         sys.excepthook = say_fault
     try:
-        with sigterm_as_ctrl_c():
+        with on_signal(signal.SIGTERM, _stop):
             execute(command, Console())
     except KeyboardInterrupt as stop:
         print("Stopped. Started again, it goes on from here.", file=sys.stderr)

@@ -1,6 +1,7 @@
 """The commands `export` and `relight`: their options and the functions that do them."""
 
 import math
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,8 +14,8 @@ from tyro.conf import Positional, arg
 from capture.errors import CaptureError
 from reconstruct.export.export import ExportOptions, OnProgress, format_for, save
 from reconstruct.export.export import export as export_run
-from reconstruct.run_folder.progress import progress
-from reconstruct.stored_run.refusal import refuse_no_run
+from reconstruct.run_folder.folder import Progress as Step
+from reconstruct.stored_run.documents import refuse_no_run
 from shadowgraph.options import Command, Given, ResultFolder
 from shadowgraph.terminal import Display, print_lines
 from viewer.stage.page import FORMATS
@@ -107,10 +108,16 @@ def export(command: Export, console: Console) -> None:
 
 @contextmanager
 def _shown(stage: str, console: Console) -> Iterator[OnProgress]:
-    """Yield a callback whose steps the terminal shows as those of a stage."""
-    display = Display(console)
+    """Yield a callback whose steps the terminal shows as those of a stage, with the time left."""
+    display, begin = Display(console), time.monotonic()
+
+    def on_progress(done: int, total: int, message: str) -> None:
+        passed = time.monotonic() - begin
+        eta = passed * (total - done) / done if done else None
+        display(Step(passed, time.process_time(), stage, done, total, eta, message))
+
     with display.progress:
-        yield progress(stage, display)
+        yield on_progress
 
 
 def _three(text: str | None, option: str) -> tuple[float, float, float] | None:

@@ -11,7 +11,7 @@ from capture.errors import ReconstructionError
 from reconstruct.stored_run.documents import lit_photos
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.display.run_follower import size_text
-from viewer.report.drawing import data_uri, mesh_picture
+from viewer.report.document import data_uri, mesh_picture
 from viewer.report.pictures import view_from_camera
 
 NEEDED = ("calibration.json", "fields.safetensors", "mesh.ply", "report.json")

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from rich.console import Console
@@ -79,7 +80,12 @@ class Display:
         self.activity(sentence)
         self._last = self._clock() + FIRST_LINE_S - LINE_EVERY_S
         ended = threading.Event()
-        thread = threading.Thread(target=_call_until, args=(self.beat, ended), name="heartbeat", daemon=True)
+
+        def go_on() -> None:
+            while not ended.wait(LOOK_EVERY_S):
+                self.beat()
+
+        thread = threading.Thread(target=go_on, name="heartbeat", daemon=True)
         thread.start()
         try:
             yield
@@ -123,11 +129,6 @@ def _beside(name: str, doing: str) -> str:
     return "" if doing.casefold() == name.casefold() else doing
 
 
-def _call_until(beat: Callable[[], None], ended: threading.Event) -> None:
-    while not ended.wait(LOOK_EVERY_S):
-        beat()
-
-
 def print_lines(console: Console, *lines: str) -> None:
     """Print lines as they are: nothing in them is markup, none is broken, and no name in them breaks one."""
     for line in lines:
@@ -147,7 +148,7 @@ def page(run_dir: Path, mode: str, console: Console) -> Iterator[None]:
     context = multiprocessing.get_context("spawn")
     receive, send = context.Pipe(duplex=False)
     process = context.Process(target=_serve, args=(run_dir, send), daemon=True)
-    with _without_ctrl_c():
+    with on_signal(signal.SIGINT, signal.SIG_IGN):  # it takes no notice of Ctrl-C: we end it
         process.start()
     send.close()
     reader = threading.Thread(target=_print_addresses, args=(receive, console), daemon=True)
@@ -165,16 +166,16 @@ def page(run_dir: Path, mode: str, console: Console) -> Iterator[None]:
 
 
 @contextmanager
-def _without_ctrl_c() -> Iterator[None]:
-    """Let processes that are started in this block take no notice of Ctrl-C: whoever started them ends them."""
+def on_signal(number: int, does: Callable[[int, FrameType | None], object] | signal.Handlers) -> Iterator[None]:
+    """Have a signal do this while the block runs. In a thread that is not the main one it changes nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = signal.signal(number, does)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, before)
 
 
 def _serve(run_dir: Path, send: Any) -> None:

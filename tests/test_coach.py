@@ -9,9 +9,8 @@ from PIL import Image
 
 import shadowgraph
 from calibration.calibration import load_calibration
-from capture.checks.first_look import FirstLook
 from capture.session import seen
-from reconstruct.check.coach import Coach, SeenLight, missing_sides, next_words, seen_lines
+from reconstruct.check.coach import Coach, FirstLook, SeenLight, missing_sides, next_words, seen_lines
 
 SPOT = Path(__file__).parent.parent / "examples" / "spot"
 LIT = [f"IMG_{number}.jpg" for number in (101, 105, 109, 113, 117, 121, 125)]

@@ -29,7 +29,7 @@ def needs_landlock(version):
 def hostile_tasks(monkeypatch):
     """Processes of their own, which know the hostile tasks."""
     stop_decoders()
-    monkeypatch.setattr(confined, "MODULES", ("capture.decode.tiff", "hostile_decoders"))
+    monkeypatch.setattr(confined, "MODULES", ("capture.decode.pictures", "hostile_decoders"))
     yield
     stop_decoders()
 
@@ -188,4 +188,4 @@ def test_elsewhere_than_on_linux_it_is_said_that_there_are_no_limits(photo, monk
     assert first_answer(hostile.well_behaved, photo).numbers[1] == os.getpid()
     with pytest.raises(CaptureError, match=r"photo\.tif is damaged"):
         first_answer(hostile.says_it_is_damaged, photo)
-    assert "capture.decode.tiff" in sys.modules
+    assert "capture.decode.pictures" in sys.modules

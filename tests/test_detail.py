@@ -27,7 +27,7 @@ from reconstruct.mesh.simplify import simplified
 from reconstruct.mesh.texture import bake, size_for
 from reconstruct.run.results import detail_is_asked, write_detail
 from reconstruct.run_folder.folder import KEPT, RunFolder
-from reconstruct.run_folder.once import once
+from reconstruct.run_folder.progress import once
 from reconstruct.scene import build_scene
 from reconstruct.shading.noise import Noise
 from reconstruct.source.photos import read_photos

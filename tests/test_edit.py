@@ -11,9 +11,9 @@ import trimesh
 from trimesh.visual import ColorVisuals
 
 from capture.errors import ReconstructionError
+from reconstruct.export.edited import Edit, edited_fields, edited_mesh, without_guess
 from reconstruct.export.export import ExportOptions, export
 from reconstruct.fields import SolvedScene
-from reconstruct.mesh.edit import Edit, edited_fields, edited_mesh, without_guess
 from reconstruct.mesh.mesh import MAX_NODES, surface_mesh
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.stored_run.stage_document import EMPTY, save_stage_document

@@ -5,8 +5,7 @@ import torch
 
 from reconstruct.appearance.brdf import LOBES
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.shadowneus.field import GridField, HashField, HashLevels
-from reconstruct.shadowneus.mlp_field import Materials, Network, NeuralField, specular
+from reconstruct.shadowneus.field import GridField, HashField, HashLevels, Materials, Network, NeuralField, specular
 
 REACH, RADIUS, GROUND = 2.0, 1.0, -0.7
 SMALL = Network(width=32, depth=3, skip=2, frequencies=3, features=8, material_width=16, material_depth=2)

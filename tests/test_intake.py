@@ -13,7 +13,8 @@ import pytest
 from PIL import Image
 
 from capture.errors import CaptureError
-from capture.intake import archive, arrivals
+from capture.intake import arrivals
+from capture.intake import parts as intake
 from capture.intake.arrivals import place_in, refuse_size, safe_name, settle
 from capture.intake.parts import OffsetError, Parts
 from capture.session.session import load_settings
@@ -320,10 +321,10 @@ def test_what_grows_as_no_photo_does_is_not_unpacked(studio, method):
 
 
 def test_an_archive_is_held_to_the_number_and_the_bytes_of_its_files(studio, monkeypatch):
-    monkeypatch.setattr(archive, "LARGEST_TOTAL", int(2.5 * len(jpeg())))
+    monkeypatch.setattr(intake, "LARGEST_TOTAL", int(2.5 * len(jpeg())))
     done = send(Parts(studio / "parts", studio), "v.zip", packed(zipfile.ZIP_STORED))
     assert len(done.arrived) == 2 and "MB are taken" in done.remarks[0]
-    monkeypatch.setattr(archive, "MOST_ENTRIES", 3)
+    monkeypatch.setattr(intake, "MOST_ENTRIES", 3)
     many = zipped({f"{k}.jpg": jpeg(k) for k in range(4)})
     assert "at most 3" in send(Parts(studio / "parts", studio), "m.zip", many).refused
 

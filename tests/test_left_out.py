@@ -19,10 +19,10 @@ from calibration.board.board import parse_board
 from calibration.board.board_photos import fit_board
 from calibration.board.recognise import board_finder
 from calibration.camera import Camera
-from capture.checks.first_look import FirstLook
 from capture.errors import CaptureError
 from capture.session.seen import SeenPhotos
 from capture.session.session import load_session
+from reconstruct.check.coach import FirstLook
 from shadowgraph.run_command import _print_result
 
 LIT = [f"IMG_{101 + k}.jpg" for k in range(6)]

@@ -5,7 +5,7 @@ import pytest
 from dataset_folders import loaded, write_photo
 from PIL import Image
 
-from calibration.scenes.list_axes import UPRIGHT, WAYS
+from calibration.scenes.unstated import UPRIGHT, WAYS
 from capture.photos.photo import encode_srgb
 
 SIDE, PHOTOS = 48, 10

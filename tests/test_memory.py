@@ -14,11 +14,12 @@ from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import load_calibration
 from calibration.known_scene import KnownScene
 from capture.files.atomic import write_json
+from capture.files.schema import read_kept
 from reconstruct.run import pipeline
 from reconstruct.run_folder import forecast
 from reconstruct.run_folder.folder import PLAN, RunFolder
 from reconstruct.run_folder.forecast import memory_room
-from reconstruct.source.photos import MARGIN, OVERRIDE, plan_for, predicted_memory, read_plan
+from reconstruct.source.photos import MARGIN, OVERRIDE, Plan, plan_for, predicted_memory
 from reconstruct.source.source import RunOptions, Source
 
 # photos, their size, preset, bytes of private memory at the peak: runs of benchmarks/soak/large.py and of examples/spot
@@ -57,10 +58,10 @@ def test_photos_go_first_then_pixels_then_photos_again_and_the_sentence_says_so(
 def test_a_plan_is_read_as_it_was_written_and_what_is_none_is_not(tmp_path):
     plan = plan_for(300, 4032, 3024, "standard", 4e9)
     write_json(tmp_path / "memory.json", asdict(plan))
-    assert read_plan(tmp_path / "memory.json") == plan
+    assert read_kept(tmp_path / "memory.json", Plan) == plan
     for content in ("", "[]", '{"photos": 3}', json.dumps(asdict(plan) | {"photos": -1}), "[" * 99999):
         (tmp_path / "memory.json").write_text(content)
-        assert read_plan(tmp_path / "memory.json") is None
+        assert read_kept(tmp_path / "memory.json", Plan) is None
 
 
 def test_a_run_may_hold_what_is_free_and_no_more_than_its_limits(tmp_path, monkeypatch):
@@ -92,11 +93,11 @@ def test_a_run_keeps_to_its_decision_and_writes_which_photos_it_left_out(tmp_pat
             thinned = kept.first
             assert sum(light.used for light in thinned.lights) == 40
             assert load_calibration(run.file("calibration.json")) == thinned
-        plan = read_plan(run.file(PLAN))
+        plan = read_kept(run.file(PLAN), Plan)
         assert plan and OVERRIDE in plan.sentence and "40 of 50 photos" in plan.sentence
         run.discard(PLAN)
         options = RunOptions(preset="draft", memory=64.0)
         assert all(light.used for light in pipeline._within_memory(source, options, run, kept).first.lights)
         assert all(light.used for light in load_calibration(run.file("calibration.json")).lights)
-        plan = read_plan(run.file(PLAN))
+        plan = read_kept(run.file(PLAN), Plan)
         assert plan is None or OVERRIDE not in plan.sentence

@@ -12,7 +12,7 @@ import pytest
 
 from capture.session.capture import load_capture
 from capture.session.session import ADVISED_LIT
-from viewer.studio.example import RESULT
+from viewer.studio.library import EXAMPLE_RESULT
 
 ROOT = Path(__file__).parent.parent
 SOURCES = (".py", ".typed", ".html", ".css", ".js", ".glsl", ".svg", ".zip")
@@ -58,7 +58,7 @@ def test_the_wheel_brings_the_parts_of_the_pages(wheel_names, folder):
 def test_the_wheel_brings_the_example_of_the_studio(wheel_names):
     there = {path.name for path in (ROOT / "examples" / "spot").rglob("*") if path.is_file()}
     assert {Path(n).name for n in wheel_names if "/share/shadowgraph/examples/spot/" in n} == there
-    assert f"viewer/studio/{RESULT.name}" in wheel_names
+    assert f"viewer/studio/{EXAMPLE_RESULT.name}" in wheel_names
 
 
 def test_each_command_of_the_readme_works_alone_in_a_fresh_clone():

@@ -7,7 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from capture.decode.panorama import LARGEST_FILE, read_panorama
+from capture.decode.exr import LARGEST_FILE, read_panorama
 from capture.errors import CaptureError
 
 

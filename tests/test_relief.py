@@ -11,7 +11,7 @@ from synthetic import Look, Sphere, render
 from test_known import write_scene
 from test_solver import Listener
 
-from calibration.scenes.ground_depth import read_ground_depth
+from calibration.scenes.shadowneus import read_ground_depth
 from capture.errors import CalibrationError, CaptureError
 from reconstruct.config import FitConfig, Level
 from reconstruct.hull.shadow_hull import shadow_hull

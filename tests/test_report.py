@@ -11,7 +11,7 @@ import trimesh
 from calibration.calibration import save_calibration
 from reconstruct.check.light_coverage import widest_gap
 from reconstruct.run_folder.folder import RunFolder
-from viewer.report.drawing import difference_picture, mesh_picture, normal_picture, reduced
+from viewer.report.document import difference_picture, mesh_picture, normal_picture, reduced
 from viewer.report.figures import curves, lights_from_above
 from viewer.report.numbers import refinement_part
 from viewer.report.pictures import guess_facts, mesh_pictures

@@ -13,8 +13,7 @@ import pytest
 from capture.errors import UserError
 from capture.files.atomic import atomic_file, write_json
 from reconstruct.run_folder.folder import RunFolder, content_hash, read_log
-from reconstruct.run_folder.once import once
-from reconstruct.run_folder.progress import log_to
+from reconstruct.run_folder.progress import log_to, once
 
 
 def test_a_file_whose_writing_fails_keeps_its_old_content_and_leaves_nothing_beside_it(tmp_path):

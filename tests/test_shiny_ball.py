@@ -12,7 +12,7 @@ from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError, CaptureError
 from reconstruct.fields import SolvedScene
-from reconstruct.run.ball_on_ground import without_ball
+from reconstruct.run.pipeline import without_ball
 from reconstruct.source.calibrate_source import calibrate_source
 from reconstruct.source.photos import read_photos
 from reconstruct.source.source import RunOptions, open_source

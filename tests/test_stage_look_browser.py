@@ -13,7 +13,7 @@ from stage_runs import stage_run
 from test_stage_page import HEIGHT, WIDTH, light_of, view_of
 
 from capture.photos.photo import decode_srgb
-from reconstruct.export.first_view import SKY
+from reconstruct.export.stage_scene import SKY
 from reconstruct.render.relight import lit_share
 from reconstruct.render.soft_light import sky_share
 from reconstruct.render.studio import FOCAL_HEIGHTS, looking_at, studio_of, towards

@@ -16,9 +16,8 @@ from calibration.light import Light
 from calibration.posed_camera import PosedCamera
 from capture.photos.photo import decode_srgb
 from reconstruct.export.export import export
-from reconstruct.export.first_view import LAMP as FIRST_LAMP
-from reconstruct.export.first_view import SKY
-from reconstruct.export.stage_scene import stage_scene
+from reconstruct.export.stage_scene import LAMP as FIRST_LAMP
+from reconstruct.export.stage_scene import SKY, stage_scene
 from reconstruct.render.g_buffer import RenderView, look
 from reconstruct.render.relight import lit_share, relight
 from reconstruct.render.studio import FOCAL_HEIGHTS, looking_at, studio_of, towards

@@ -10,9 +10,9 @@ from test_studio_browser import DESKTOP, PHONE, RULES, opened
 
 from capture.errors import CaptureError
 from capture.session.session import load_settings
-from capture.session.skipped import photos_of
+from capture.session.sorting import photos_of
 from reconstruct.stored_run.stage_pack import opened_pack
-from viewer.studio import example, studio
+from viewer.studio import library, studio
 
 SMALL = {"width": 1000, "height": 640}
 TITLE = "Übung & 1"
@@ -33,8 +33,8 @@ def stage_of(tab):
 
 
 def test_the_example_that_ships_is_small_and_of_the_stage_as_it_is():
-    assert opened_pack(example.RESULT), "another format: make it anew with .ci/example_result.py"
-    assert example.RESULT.stat().st_size < 500_000
+    assert opened_pack(library.EXAMPLE_RESULT), "another format: make it anew with .ci/example_result.py"
+    assert library.EXAMPLE_RESULT.stat().st_size < 500_000
 
 
 def test_the_example_is_a_capture_and_a_run_of_its_own_each_time(tmp_path):
@@ -43,7 +43,7 @@ def test_the_example_is_a_capture_and_a_run_of_its_own_each_time(tmp_path):
         cards = {card["key"]: card for card in owner.get("/api/state")[1]["cards"]}
     assert len(set(runs)) == len(cards) == 3
     for key, card in cards.items():
-        assert card["title"] == example.TITLE and len(card["runs"]) == 1
+        assert card["title"] == library.EXAMPLE and len(card["runs"]) == 1
         assert len(photos_of(tmp_path / key)) == card["count"] == 45 and load_settings(tmp_path / key).board
 
 

@@ -16,13 +16,11 @@ from reconstruct.render.g_buffer import surface_maps
 from reconstruct.run import solve_stage
 from reconstruct.shadowneus import trainer
 from reconstruct.shadowneus.config import ABLATIONS, ShadowSamples, TrainConfig, Weights, ablated
-from reconstruct.shadowneus.field import HashLevels
-from reconstruct.shadowneus.mlp_field import Network
+from reconstruct.shadowneus.field import HashLevels, Network
 from reconstruct.shadowneus.model import Model
-from reconstruct.shadowneus.train_pixels import make_train_pixels
+from reconstruct.shadowneus.train_pixels import make_train_pixels, object_frame, unit_height
 from reconstruct.shadowneus.train_step import losses
 from reconstruct.shadowneus.trainer import iterations, load_training, save_training, train
-from reconstruct.shadowneus.unit_frame import object_frame, unit_height
 
 BALL = Sphere((12.0, -6.0, 32.0), 32.0)
 # The paper's weights suit 150 000 iterations; in 100 the ground must not win before the shadows have been seen.

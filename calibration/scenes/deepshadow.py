@@ -16,7 +16,7 @@ from capture.errors import CalibrationError
 from capture.files.names import inside
 from capture.files.schema import Number, Positive, read_scene, read_text
 from capture.photos.photo import read_grey
-from capture.session.scene_photos import scene_photos
+from capture.session.sorting import scene_photos
 
 LIGHTS, PARAMETERS, PICTURES = "all_object_lights.txt", "params.json", "0"
 BACKGROUND = 0.5  # of the silhouette's white: darker pixels are bare ground
@@ -58,30 +58,24 @@ def load_deepshadow(folder: Path) -> KnownScene:
     shadow, places = tuple(usable.paths), places[usable.rows]
     height, width = read_grey(shadow[0]).shape
     given = read_scene(folder / PARAMETERS, _Parameters)
-    focal = given.focal_length
     eye = np.array([given.cam_location_x, given.cam_location_y, given.cam_location_z])
-    camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
+    camera = Camera.centred(width, height, given.focal_length)
     lights = tuple(Light(path.name, "point", position=place) for place, path in zip(places, shadow, strict=True))
     nearest = float(np.linalg.norm(places - eye, axis=1).min())
     ground = min(eye[2] - BELOW_LIGHTS * nearest, float(places[:, 2].min()) - 0.5 * BELOW_LIGHTS * nearest)
+    # white on black, named after the first picture
+    mask = folder / PICTURES / f"{shadow[0].name.split('_0_0')[0]}_silhouette.png"
+    is_blank = not mask.is_file() or (read_grey(mask) >= BACKGROUND).all()
     return KnownScene(
         Calibration(camera, Pose(LOOKING_DOWN, eye), float(ground), lights, unit="scene"),
         rgb_paths=None,
         shadow_paths=shadow,
-        mask_path=_silhouette(folder, usable.paths[0].name),
+        mask_path=None if is_blank else mask,
         photos_left_out=usable.left_out,
         every_photo=usable.every,
         mask_is_grey=True,
         ground_known=False,
     )
-
-
-def _silhouette(folder: Path, first: str) -> Path | None:
-    """The object's silhouette (white on black), named after the first picture; None if missing or without black."""
-    path = folder / PICTURES / f"{first.split('_0_0')[0]}_silhouette.png"
-    if not path.is_file() or (read_grey(path) >= BACKGROUND).all():
-        return None
-    return path
 
 
 IMPORTER = Importer("DeepShadow (all_object_lights.txt)", _recognised, lambda folder, _: load_deepshadow(folder))

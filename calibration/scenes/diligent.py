@@ -18,7 +18,7 @@ from capture.decode.formats import decode
 from capture.errors import CalibrationError
 from capture.files.regular import why
 from capture.files.schema import read_text
-from capture.session.scene_photos import scene_photos
+from capture.session.sorting import scene_photos
 
 DIRECTIONS, INTENSITIES, NAMES, MASK = "light_directions.txt", "light_intensities.txt", "filenames.txt", "mask.png"
 

@@ -16,13 +16,12 @@ from calibration.light import Light, Vector
 from calibration.lights.power import with_common_power
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
-from calibration.scenes.list_axes import judged
-from calibration.scenes.unstated import read_shading
+from calibration.scenes.unstated import judged, read_shading
 from capture.decode.exif import focal_in_pixels, focal_of, orientation_of
 from capture.decode.formats import read_exif, read_size
 from capture.errors import CaptureError
-from capture.session.scene_photos import ScenePhotos
 from capture.session.seen import each_or_fault, usual_size
+from capture.session.sorting import ScenePhotos
 
 LOOKING_DOWN = np.diag([1.0, -1.0, -1.0])  # world from camera: x right, image down is -y, forward is -z
 FAR = 10.0  # focal length over the picture's longer side: rays are parallel to 3 degrees, as a long lens's are
@@ -34,7 +33,7 @@ LOWEST = 0.02  # sine of a light's angle over the picture: below (1 degree) noth
 
 def _looking_down(width: int, height: int, focal: float) -> PosedCamera:
     """Return a camera that looks along -z at the origin from the height of its focal length; the ground is z = 0."""
-    camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
+    camera = Camera.centred(width, height, focal)
     return PosedCamera(camera, Pose(LOOKING_DOWN, np.array([0.0, 0.0, focal])), 0.0)
 
 

@@ -19,11 +19,11 @@ OF_A_CAPTURE = (SETTINGS, BOARD)  # what a capture of ours has and no other layo
 
 
 def importers() -> tuple[Importer, ...]:
-    """Return the importers of other programs' layouts: IMPORTER of every module of this package that has one."""
+    """Return the importers of other programs' layouts: each that a module of this package has among its names."""
     package = importlib.import_module(__name__.rpartition(".")[0])
     modules = (importlib.import_module(f"{package.__name__}.{m.name}") for m in pkgutil.iter_modules(package.__path__))
-    found = (getattr(module, "IMPORTER", None) for module in modules)
-    return tuple(importer for importer in found if importer is not None)
+    found = [value for module in modules for value in vars(module).values() if isinstance(value, Importer)]
+    return tuple(dict.fromkeys(found))
 
 
 def find_importer(folder: Path, lights: Path | None = None) -> Importer | None:
@@ -34,11 +34,16 @@ def find_importer(folder: Path, lights: Path | None = None) -> Importer | None:
             photo, none of them shows a board, and it is the layout where there is no other.
 
     Raises:
-        CaptureError: the folder looks like several layouts; the message lists the files responsible.
+        CaptureError: the folder looks like several layouts; the message lists the files responsible. Or its
+            session.toml is wrong.
     """
     is_a_capture = (folder / SETTINGS).exists()
-    if (folder / BOARD).exists() or (is_a_capture and _names_a_board(folder)):
+    if (folder / BOARD).exists():
         return None
+    if is_a_capture:
+        settings = load_settings(folder)
+        if settings.board is not None or BOARD in settings.roles:
+            return None
     named = _name_in(folder, lights)
     others = () if is_a_capture else (one for one in importers() if not one.gives_way)
     every = (*others, listed_lights(lights if lights is not None and lights.is_file() else None))
@@ -52,16 +57,6 @@ def find_importer(folder: Path, lights: Path | None = None) -> Importer | None:
             f"{folder} looks like {listed}; one layout was needed. Move the files of the others out of the folder."
         )
     return reasons[0][0] if reasons else None
-
-
-def _names_a_board(folder: Path) -> bool:
-    """Return True if session.toml says which board is in the photos, or which photos show it.
-
-    Raises:
-        CaptureError: it is wrong.
-    """
-    settings = load_settings(folder)
-    return settings.board is not None or BOARD in settings.roles
 
 
 def _name_in(folder: Path, lights: Path | None) -> str:

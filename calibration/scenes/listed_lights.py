@@ -4,6 +4,10 @@ The file: any that calibration.lights.files reads. Directions and places are in 
 distant_camera): x right, y up, z towards the camera, the unit a pixel. A calibration.json brings its own camera, ground
 and unit. RTI's lists may name fewer photos than there are; any other file gives a light to each photo of one folder.
 
+RTI folders: the .lp file holds the number of lights, then `name x y z` per photo. Decimal commas, full paths of another
+machine and lists without a count are read. It may lie beside the photos, or in a folder of its own beside theirs
+(assembly-files/ and jpeg-exports/ of RTIBuilder).
+
 Photos without board and list of lights, in which a shiny ball shows where the light is.
 """
 
@@ -24,9 +28,9 @@ from calibration.lights.shiny_ball import GROWN, Ball, find_ball, lights_of
 from calibration.posed_camera import PosedCamera
 from calibration.scenes.distant_camera import distant_light, distant_scene, picture_camera
 from capture.decode.formats import read_size
-from capture.errors import CalibrationError, CaptureError
+from capture.errors import CalibrationError, CaptureError, Remedy
 from capture.photos.photo import read_stack
-from capture.session.scene_photos import ScenePhotos, scene_photos
+from capture.session.sorting import ScenePhotos, scene_photos
 
 LONG_SIDE = 1000  # px of the pictures in which ball and highlights are measured
 FEWEST_LIGHTS = 4  # photos whose highlight was found
@@ -264,3 +268,41 @@ def _with_its_camera(photos: ScenePhotos, own: Calibration, given: GivenLights, 
         photos_left_out=photos.left_out,
         every_photo=photos.every,
     )
+
+
+# --- RTI: an .lp file ----------------------------------------------------------------------------------------------
+
+
+def _recognised(folder: Path) -> str | None:
+    lists = _lists(folder)
+    has_photos = bool(lists) and any(photos_in(place) for place in folders_of(folder))
+    return f"{lists[0].relative_to(folder)} and photos" if has_photos else None
+
+
+def _load(folder: Path, split: str) -> KnownScene:
+    """Photos and directional lights in the picture's frame; the ground is unknown.
+
+    Raises:
+        CalibrationError, CaptureError: several lists, a line that is no light, or lines that fit no photos.
+    """
+    lists = _lists(folder)
+    if len(lists) > 1:
+        names = ", ".join(str(path.relative_to(folder)) for path in lists)
+        raise CalibrationError(
+            f"{folder} holds {len(lists)} lists of lights ({names}), one was needed.",
+            "remove the others",
+            Remedy.LIGHTS_FILE,
+        )
+    return load_listed(folder, lists[0])
+
+
+def _lists(folder: Path) -> list[Path]:
+    """The .lp files in the folder, else those in the folders in it."""
+    for places in ([folder], folders_of(folder)[1:]):
+        found = sorted(p for place in places for p in place.iterdir() if p.suffix.lower() == ".lp" and p.is_file())
+        if found:
+            return found
+    return []
+
+
+RTI = Importer("RTI (.lp)", _recognised, _load)

@@ -22,7 +22,7 @@ from capture.files.atomic import atomic_folder, write_json
 from capture.files.names import inside
 from capture.files.schema import Text, read_scene
 from capture.photos.photo import read_alpha, read_grey
-from capture.session.scene_photos import scene_photos
+from capture.session.sorting import scene_photos
 
 FORMAT = 1
 MARKER, CALIBRATION, PHOTOS, SHADOWS, MASK = "import.json", "calibration.json", "photos", "shadows", "mask.png"

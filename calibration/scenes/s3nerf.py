@@ -31,7 +31,7 @@ from capture.decode.formats import read_size
 from capture.errors import CalibrationError
 from capture.files.arrays import read_npy
 from capture.files.schema import EXPORT, Count, Vector, as_type, read_json
-from capture.session.scene_photos import scene_photos
+from capture.session.sorting import scene_photos
 
 PARAMETERS, PHOTOS, SHADOWS, MASK = "params.json", "rgb", "visibility", "mask_obj.png"
 DIRECTIONS = "light_direction_sdps.npy"

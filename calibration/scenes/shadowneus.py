@@ -1,4 +1,7 @@
-"""Scenes that come with their camera, ground and lights: the layout of ShadowNeuS, NeRF-synthetic plus light poses."""
+"""Scenes that come with their camera, ground and lights: the layout of ShadowNeuS, NeRF-synthetic plus light poses.
+
+Uneven ground of such a scene: a depth map of the bare ground, on the grid of the photos.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,16 +20,22 @@ from calibration.lights.known_ground import shading_misfit
 from calibration.lights.layouts import FROM_BLENDER, Floor, Frame, Frames
 from calibration.lights.power import with_common_power
 from calibration.pose import Pose
-from calibration.scenes.ground_depth import find_ground_depth
+from capture.decode.exr import read_exr
 from capture.errors import CalibrationError
+from capture.files.arrays import read_npy
 from capture.files.names import inside
 from capture.files.schema import read_scene
 from capture.photos.photo import read_photo, read_stack
-from capture.session.scene_photos import scene_photos
+from capture.session.sorting import scene_photos
 
 PREVIEW_LONG_SIDE = 128  # px: enough for one number per scene (kind of light, power)
 SAME_CAMERA_TOLERANCE = 1e-4  # scene units or unit vectors: exporters round to six digits
 SHADOW_PICTURE_SHARE = 0.98  # of the pixels are black or white in a picture of shadows
+PATTERN = "floor/*_depth_*"  # of the authors' bumpy scenes
+LARGEST_DEPTH = 2**30  # bytes: float64 of 130 megapixels
+KINDS = (".exr", ".npy")
+FEWEST_KNOWN = 0.02  # of the picture: with less ground nothing can be bounded by shadows on it
+NOTHING = 1e6  # renderers write 1e10 or so where they hit nothing
 
 
 class _Kind(Struct):
@@ -58,11 +67,12 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
         CalibrationError: a file or field is missing or impossible; the message names both.
     """
     source = folder / f"transforms_{split}.json"
-    description = _described(source)
+    if not source.is_file():
+        others = ", ".join(sorted(p.name for p in folder.glob("transforms_*.json"))) or "no transforms_*.json"
+        raise CalibrationError(f"{source} does not exist; the folder has {others}.")
+    description = read_scene(source, _Description)
     frames = description.frames
-    pictures = [_picture_path(folder, frame, i, source) for i, frame in enumerate(frames)]
-    if len({p.name for p in pictures}) < len(pictures):
-        raise CalibrationError(f"{source}: two frames share the file name of their 'file_path'; give each its own.")
+    pictures = _pictures(frames, source)
     shadow_paths = _shadow_paths(pictures)
     usable = scene_photos(pictures, *([shadow_paths] if shadow_paths else []))
     every, pictures, kept = pictures, usable.paths, {path.name for path in usable.paths}
@@ -74,7 +84,8 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
             raise CalibrationError(f"{source}: shadow pictures of several lights at once; one light each is needed.")
         shadow_paths = None  # they do not show which of the lights is hidden
     stack = read_stack(pictures, PREVIEW_LONG_SIDE)
-    camera = _camera(description.camera_angle_x, stack.full_width, stack.full_height)
+    focal = stack.full_width / 2 / np.tan(description.camera_angle_x / 2)
+    camera = Camera.centred(stack.full_width, stack.full_height, focal)
     world_from_camera = _fixed_camera(frames, source)
     height = read_scene(folder / "transforms_floor.json", Floor).frames[0].transform_ground[2][3]
     if world_from_camera.translation[2] <= height:
@@ -101,16 +112,14 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
     )
 
 
-def _described(source: Path) -> _Description:
-    if not source.is_file():
-        others = ", ".join(sorted(p.name for p in source.parent.glob("transforms_*.json"))) or "no transforms_*.json"
-        raise CalibrationError(f"{source} does not exist; the folder has {others}.")
-    return read_scene(source, _Description)
-
-
-def _picture_path(folder: Path, frame: Frame, index: int, source: Path) -> Path:
-    name = frame.file_path
-    return inside(folder, name if name.endswith(".png") else name + ".png", f"{source}, frame {index}: 'file_path'")
+def _pictures(frames: Sequence[Frame], source: Path) -> list[Path]:
+    pictures = [
+        inside(source.parent, f"{frame.file_path.removesuffix('.png')}.png", f"{source}, frame {i}: 'file_path'")
+        for i, frame in enumerate(frames)
+    ]
+    if len({p.name for p in pictures}) < len(pictures):
+        raise CalibrationError(f"{source}: two frames share the file name of their 'file_path'; give each its own.")
+    return pictures
 
 
 def _shadow_paths(pictures: list[Path]) -> list[Path] | None:
@@ -131,11 +140,6 @@ def _is_shadow_picture(path: Path) -> bool:
     return bool(two_valued and np.allclose(rgb, grey[..., None], atol=0.005))
 
 
-def _camera(angle: float, width: int, height: int) -> Camera:
-    focal = width / 2 / np.tan(angle / 2)
-    return Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
-
-
 def _fixed_camera(frames: Sequence[Frame], source: Path) -> Pose:
     matrices = [np.array(frame.transform_matrix) for frame in frames]
     moved = [i for i, m in enumerate(matrices) if not np.allclose(m, matrices[0], atol=SAME_CAMERA_TOLERANCE)]
@@ -152,18 +156,53 @@ def _fixed_camera(frames: Sequence[Frame], source: Path) -> Pose:
 def _lights(frames: Sequence[Frame], pictures: list[Path], kind: str, height: float, source: Path) -> tuple[Light, ...]:
     lights = []
     for i, (frame, path) in enumerate(zip(frames, pictures, strict=True)):
-        where = f"{source}, frame {i}"
-        lights += [_light(matrix, path.name, kind, height, where) for matrix in np.array(frame.transform_matrix_sun)]
+        for matrix in np.array(frame.transform_matrix_sun):
+            place, towards = matrix[:3, 3], matrix[:3, 2]  # the light shines along its -z
+            if kind != "point":
+                length = max(float(np.linalg.norm(towards)), 1e-12)
+                lights.append(Light(path.name, kind, direction=towards / length))
+            elif place[2] > height:
+                lights.append(Light(path.name, kind, position=place))
+            else:
+                below = f"puts the light below the ground (z = {height:g})."
+                raise CalibrationError(f"{source}, frame {i}: 'transform_matrix_sun' {below}")
     return tuple(lights)
 
 
-def _light(matrix: Float[np.ndarray, "4 4"], photo: str, kind: str, height: float, where: str) -> Light:
-    place, towards = matrix[:3, 3], matrix[:3, 2]  # the light shines along its -z
-    if kind == "point" and place[2] - height <= 0:
-        raise CalibrationError(f"{where}: 'transform_matrix_sun' puts the light below the ground (z = {height:g}).")
-    if kind == "point":
-        return Light(photo, kind, position=place)
-    return Light(photo, kind, direction=towards / max(float(np.linalg.norm(towards)), 1e-12))
-
-
 IMPORTER = Importer("ShadowNeuS, rendered (transforms_*.json)", _recognised, load_known_scene)
+
+
+def find_ground_depth(folder: Path) -> Path | None:
+    """Return the first floor/*_depth_*.exr or .npy of a scene, by name; None if the ground is a plane."""
+    paths = sorted(path for path in folder.glob(PATTERN) if path.suffix.lower() in KINDS)
+    return paths[0] if paths else None
+
+
+def read_ground_depth(path: Path, camera: Camera) -> Float[np.ndarray, "height width"]:
+    """Return z-depth of the bare ground at pixel centres, OpenCV camera axes, scene units; nan without ground.
+
+    Args:
+        path: .npy, or .exr whose first channel is read.
+        camera: of the photos, whose size the map must have.
+
+    Raises:
+        CaptureError: not readable.
+        CalibrationError: another size than the photos, or hardly any ground in it.
+    """
+    if path.suffix.lower() == ".exr":
+        channels = read_exr(path)
+        depth = channels[next((n for n in ("Z", "R", "V", "Y", "B") if n in channels), min(channels))].astype(float)
+    else:
+        depth = read_npy(path, LARGEST_DEPTH)
+    if depth.shape != (camera.height, camera.width):
+        raise CalibrationError(
+            f"{path} is {' x '.join(map(str, depth.shape[::-1]))}, {camera.width} x {camera.height} pixels as the "
+            "photos was needed. Render the bare ground with the camera of the photos."
+        )
+    known = np.isfinite(depth) & (depth > 0) & (depth < NOTHING)
+    if known.mean() < FEWEST_KNOWN:
+        raise CalibrationError(
+            f"{path}: {100 * known.mean():.2g} % of the pixels have a positive, finite depth, {100 * FEWEST_KNOWN:g} % "
+            "were needed. It must hold the z-depth of the bare ground in the unit of the scene."
+        )
+    return np.where(known, depth, np.nan)

@@ -20,7 +20,7 @@ from calibration.lights.power import with_common_power
 from capture.decode.formats import read_size
 from capture.errors import CalibrationError
 from capture.files.arrays import read_npz
-from capture.session.scene_photos import scene_photos
+from capture.session.sorting import scene_photos
 
 PHOTOS, MASK = "image", "mask.png"
 ARRAYS = ("light_pose", "camera_pose", "camera_intrinsics", "floor_height")

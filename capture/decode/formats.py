@@ -14,9 +14,8 @@ from PIL import Image
 from capture.decode.exr import colour_channels, exr_size, read_exr
 from capture.decode.heif import read_heif, read_heif_header
 from capture.decode.limits import broken, check_size
-from capture.decode.raw import raw_size, read_raw
+from capture.decode.pictures import opencv_channels, raw_size, read_raw, read_tiff
 from capture.decode.sandbox import DAMAGED
-from capture.decode.tiff import opencv_channels, read_tiff
 from capture.decode.video import read_clip, read_frame
 from capture.errors import CaptureError
 from capture.files.names import clip_of, is_shown
@@ -187,12 +186,11 @@ def decode(path: Path) -> DecodedPhoto:
         "raw": read_raw,
         "heif": read_heif,
         "avif": read_heif,
-        "png": _decode_png,
         "tiff": lambda path: read_tiff(path, *_tiff_size(path))[0],
         "exr": _decode_exr,
         "clip": lambda path: read_frame(*(clip_of(path) or (path, 0.0))),
     }
-    decoder = decoders.get(format_of(path), _decode_jpeg)
+    decoder = decoders.get(format_of(path), _decode_picture)
     try:
         pixels = decoder(path)
     except DAMAGED as error:
@@ -217,11 +215,13 @@ def decode_small(path: Path, long_side: int) -> Shaped[np.ndarray, "height width
         raise broken(path, error) from error
 
 
-def _decode_jpeg(path: Path) -> Shaped[np.ndarray, "height width 3"]:
-    """Decode a JPEG; Pillow ignores its orientation tag."""
+def _decode_picture(path: Path) -> Shaped[np.ndarray, "height width 3"]:
+    """Decode a JPEG or PNG; Pillow ignores its orientation tag, and does not keep 16 bits per channel."""
     with Image.open(path) as image:
         check_size(path, *image.size)
-        return _rgb(image)
+        if image.format != "PNG" or (not image.mode.startswith("I") and _png_depth(path) == 8):
+            return _rgb(image)
+    return opencv_channels(path.read_bytes())[0]
 
 
 def _rgb(image: Image.Image) -> UInt8[np.ndarray, "height width 3"]:
@@ -232,14 +232,6 @@ def _rgb(image: Image.Image) -> UInt8[np.ndarray, "height width 3"]:
         strip = image.crop((0, top, width, min(top + STRIP_ROWS, height)))
         pixels[top : top + STRIP_ROWS] = np.asarray(strip.convert("RGB"))
     return pixels
-
-
-def _decode_png(path: Path) -> Shaped[np.ndarray, "height width 3"]:
-    with Image.open(path) as image:
-        check_size(path, *image.size)
-        if not image.mode.startswith("I") and _png_depth(path) == 8:
-            return _rgb(image)
-    return opencv_channels(path.read_bytes())[0]
 
 
 def stored_channels(
@@ -276,7 +268,6 @@ def _tiff_size(path: Path) -> tuple[int, int]:
 
 def _decode_exr(path: Path) -> Float[np.ndarray, "height width 3"]:
     """Decode the colour. The values are linear: negative ones are noise and become 0."""
-    check_size(path, *exr_size(path))
     channels = read_exr(path)
     if (pixels := colour_channels(channels)) is None:
         raise CaptureError(

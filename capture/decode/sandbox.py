@@ -51,7 +51,7 @@ LARGEST_MESSAGE = 1 << 16  # bytes
 MOST_NUMBERS, MOST_NAMES, LONGEST_NAME = 16, 64, 255
 SAMPLES = {"uint8", "uint16", "float32"}
 # modules that tasks may come from
-MODULES = tuple(f"capture.decode.{name}" for name in ("heif", "raw", "exr", "tiff", "video", "small_picture"))
+MODULES = tuple(f"capture.decode.{name}" for name in ("heif", "exr", "pictures", "video"))
 DAMAGED = (OSError, SyntaxError, ValueError, EOFError, RuntimeError, TypeError, cv2.error, rawpy.LibRawError)
 
 
@@ -62,6 +62,17 @@ class Answer:
     numbers: tuple[int | float, ...] = ()
     names: tuple[str, ...] = ()
     pixels: Shaped[np.ndarray, "..."] | None = None
+
+
+def header_of(path: Path, answer: Answer | None, count: int) -> tuple[int, ...]:
+    """Return the `count` whole numbers of a task's first answer.
+
+    Raises:
+        CaptureError: it has none.
+    """
+    if answer is None or len(answer.numbers) != count:
+        raise broken(path, "no header")
+    return tuple(map(int, answer.numbers))
 
 
 Task = Callable[..., Iterator[Answer]]  # of a file that is open, and plain arguments

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from capture.errors import CaptureError
 from capture.files.atomic import atomic_file
-from capture.files.names import DEVICES
+from capture.files.names import DEVICES, in_one_line
 from capture.files.regular import read_regular
 
 TITLE = ".title"  # in the folder of a capture or run, UTF-8; no input of a run: a title may change while one waits
@@ -37,8 +37,7 @@ def plain_title(title: str) -> str:
     Raises:
         CaptureError: it has no letter.
     """
-    letters = "".join(letter if letter.isprintable() else " " for letter in title)
-    if not (shown := " ".join(letters.split())[:LONGEST].strip()):
+    if not (shown := " ".join(in_one_line(title).split())[:LONGEST].strip()):
         raise CaptureError("A title of at least one letter is needed.")
     return shown
 

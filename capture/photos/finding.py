@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from capture.files.atomic import read_json, write_json
 
@@ -56,11 +55,9 @@ def kept_findings(folder: Path, photos: Sequence[Path]) -> tuple[Finding, ...] |
     by_name = {str(photo): photo for photo in photos}
     try:
         rows = read_json(folder / KEPT)
-        return tuple(Finding(**row | {"photo": by_name[row["photo"]], "homography": _numbers(row)}) for row in rows)
+        for row in rows:
+            row["photo"] = by_name[row["photo"]]
+            row["homography"] = row["homography"] and tuple(map(float, row["homography"]))
+        return tuple(Finding(**row) for row in rows)
     except (OSError, ValueError, KeyError, TypeError):
         return None
-
-
-def _numbers(row: dict[str, Any]) -> tuple[float, ...] | None:
-    numbers = row["homography"]
-    return None if numbers is None else tuple(map(float, numbers))

@@ -30,7 +30,6 @@ from capture.session.declared_objects import (
 )
 from capture.session.roles import NoBoardError, Roles
 from capture.session.seen import SeenPhotos
-from capture.session.skipped import naming_skipped
 from capture.session.sorting import (
     FEWEST_LIT,
     MASK,
@@ -39,6 +38,7 @@ from capture.session.sorting import (
     SoundPhotos,
     is_beside,
     is_sorted,
+    naming_skipped,
     photos_in,
     sorted_roles,
     sound_photos,

@@ -1,18 +1,24 @@
 """Sort a capture's photos by role, and leave out those that are of no use: unreadable, copies, of another size.
 
 The program and the coach, which looks while photos arrive, both sort with these functions.
+
+ScenePhotos: the same for a scene that comes with its lights. Pictures that are not read, and must not be missed in
+silence: other formats, names that are no text.
 """
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from capture.decode.formats import format_of, is_photo_name
+from capture.decode.formats import format_of, is_photo_name, read_size
 from capture.errors import CaptureError
-from capture.files.names import natural_order
-from capture.photos.finding import Finding
-from capture.session.roles import EVEN, SAME_VIEW, NoBoardError, Roles, agreement, find_tripods, roles_of
-from capture.session.seen import SAME_STEPS, SeenPhotos, usual_size
+from capture.files.names import is_clip_name, natural_order
+from capture.photos.finding import Finding, grouped
+from capture.photos.photo import read_thumbnail
+from capture.session.roles import EVEN, SAME_VIEW, THUMBNAIL_PX, NoBoardError, Roles, agreement, find_tripods, roles_of
+from capture.session.seen import SAME_STEPS, SeenPhotos, each_or_fault, usual_size
 
 ROLE_FOLDERS = {"board": "board", "lit": "photos", "light": "light", "dark": "dark", "side": "side"}
 MASK = "mask.png"  # beside session.toml: white on the object, pixels of the photos
@@ -21,6 +27,11 @@ FEWEST_LIT = 4  # below this, shadows leave most of the shape open
 SORTED = ("lit", "board")  # a capture with a folder of one of these has its photos in folders
 
 ByRole = Mapping[str, Sequence[Path]]
+OTHER_FORMATS = re.compile(
+    r"\.(jxl|webp|gif|bmp|jp2|j2k|jpf|jpx|jxr|wdp|bpg|hdr|p[bgnp]m|pfm|tga|psd|mpo|jps|insp|lfr"
+    r"|gpr|iiq|3fr|fff|erf|mrw|nrw|sr2|srf|x3f|rwl|mef|mos|dcr|crw)",  # cameras' own
+    re.IGNORECASE,
+)
 
 
 @dataclass(frozen=True)
@@ -168,3 +179,105 @@ def _is_raw(path: Path) -> bool:
         return format_of(path) == "raw"
     except CaptureError:
         return False
+
+
+@dataclass(frozen=True)
+class ScenePhotos:
+    """The photos that count, those that are left out, and which lights belong to the former."""
+
+    paths: list[Path]
+    rows: list[int]  # the place of each among all photos: lists of lights by order count all
+    every: tuple[str, ...] = ()  # the names of all photos, in that order
+    left_out: tuple[Finding, ...] = ()
+
+
+def scene_photos(photos: Sequence[Path], *beside: Sequence[Path]) -> ScenePhotos:
+    """Leave out photos that cannot be read or have another size than most; copies stay, as each has a light.
+
+    Args:
+        photos: in the order of their lights, before any is left out.
+        beside: further pictures, one for each photo, as of its shadows: a photo counts if all of its pictures do.
+
+    Raises:
+        CaptureError: photos are left out, and fewer than FEWEST_LIT stay; names them all.
+    """
+    faults = [_faults(pictures) for pictures in (photos, *beside)]
+    left_out = tuple(one for found in faults for one in found.values())
+    rows = [row for row in range(len(photos)) if not any(row in found for found in faults)]
+    if left_out and len(rows) < FEWEST_LIT:
+        raise CaptureError(
+            f"{len(rows)} of {len(photos)} photos in {photos[0].parent} can be used, {FEWEST_LIT} are needed. "
+            f"{grouped(left_out)}. Replace these files."
+        )
+    return ScenePhotos([photos[row] for row in rows], rows, tuple(path.name for path in photos), left_out)
+
+
+def _faults(pictures: Sequence[Path]) -> dict[int, Finding]:
+    """Return what is wrong with pictures that should have one size, by their place among them."""
+    found = each_or_fault(_size, pictures)
+    wanted = usual_size([one for one in found if not isinstance(one, str)])
+    return {
+        row: Finding(path, "unreadable", one, 0.0, 0.0, True)
+        if isinstance(one, str)
+        else other_size(path, one, wanted, "lit")
+        for row, (path, one) in enumerate(zip(pictures, found, strict=True))
+        if one != wanted
+    }
+
+
+def _size(path: Path) -> tuple[int, int]:
+    """Return the size of a photo that can be read to its end."""
+    read_thumbnail(path, THUMBNAIL_PX)
+    return read_size(path)
+
+
+def photos_of(capture: Path) -> list[Path]:
+    """Return the photos of a capture, folder by folder, in the natural order of their names; no mask."""
+    found: list[Path] = []
+    for place in (capture, *(capture / name for name in ROLE_FOLDERS.values())):
+        if place.is_dir():
+            mine = [path for path in place.iterdir() if is_photo_name(path) and path.name != MASK and path.is_file()]
+            found += sorted(mine, key=natural_order)
+    return found
+
+
+def folder_role(photo: Path, capture: Path) -> str:
+    """Return the role that a photo's folder gives it; "" for one in the capture itself."""
+    return next((role for role, name in ROLE_FOLDERS.items() if photo.parent == capture / name), "")
+
+
+def clips_of(capture: Path) -> list[Path]:
+    """Return the clips of a capture."""
+    places = [place for place in (capture, capture / ROLE_FOLDERS["lit"]) if place.is_dir()]
+    return [path for place in places for path in sorted(place.iterdir()) if is_clip_name(path) and path.is_file()]
+
+
+def skipped_pictures(folder: Path) -> str:
+    """Return a sentence on the pictures that are not read in a capture's folders; or ""."""
+    places = [place for place in (folder, *(folder / name for name in ROLE_FOLDERS.values())) if place.is_dir()]
+    found = [path for place in places for path in sorted(place.iterdir()) if _is_skipped(path) and path.is_file()]
+    if not found:
+        return ""
+    first = _as_text(found[0]).name + (f" and {len(found) - 1} more" if len(found) > 1 else "")
+    return f"skipped, because they cannot be read: {first}. Export them as JPEG, PNG, TIFF or DNG, under plain names."
+
+
+@contextmanager
+def naming_skipped(folder: Path) -> Iterator[tuple[str, ...]]:
+    """Yield what is to be noted of skipped pictures; an error of the block ends with it, too."""
+    said = skipped_pictures(folder)
+    try:
+        yield (said,) if said else ()
+    except CaptureError as error:
+        if not said:
+            raise
+        raise type(error)(f"{error} Pictures were {said}") from error
+
+
+def _is_skipped(path: Path) -> bool:
+    is_photo = is_photo_name(_as_text(path)) and not is_photo_name(path)
+    return not path.name.startswith(".") and (is_photo or OTHER_FORMATS.fullmatch(path.suffix) is not None)
+
+
+def _as_text(path: Path) -> Path:
+    return path.with_name(path.name.encode("utf-8", "replace").decode())

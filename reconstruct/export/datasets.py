@@ -22,8 +22,8 @@ from capture.files.title import file_stem
 from capture.photos.photo import encode_srgb, write_picture
 from reconstruct.export.dataset import Dataset, centred, kind_of, light_matrix, open_dataset, opengl
 from reconstruct.export.export import Contents, ExportOptions, OnProgress, Writer
-from reconstruct.export.solid import ZIP_TIME
 from reconstruct.render.g_buffer import look, surface_maps
+from reconstruct.stored_run.stage_pack import ZIP_TIME
 from reconstruct.stored_run.stored_run import StoredRun
 
 POINTS_LONG_SIDE = 160  # px: some ten thousand points of the surface, as usual in sparse models

@@ -44,7 +44,10 @@ def depth(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnPro
     on_progress(0, 1, "depth")
     values = read_depth(run.run_dir / DEPTH)
     seen = np.isfinite(values)
-    near, far = _range(values, seen)
+    if not seen.any():
+        raise ReconstructionError("the camera sees no object, so there is no depth to save. Look at the report.")
+    near, far = float(values[seen].min()), float(values[seen].max())
+    far = max(far, np.nextafter(np.float32(near), np.float32(np.inf)).item())
     if path.suffix.lower() == ".exr":
         channels = {"Z": np.where(seen, values, 0).astype(np.float32), "A": seen.astype(np.float32)}
         write_exr(path, channels, _header(run, "z-depth along the camera's axis, 0 where no object is seen"))
@@ -76,13 +79,6 @@ def _normals(run: StoredRun) -> Float[np.ndarray, "height width 3"]:
     there = (length > 0) & (normals[part] != 0).any(-1, keepdims=True)
     normals[part] = np.where(there, finer / np.maximum(length, 1), normals[part])
     return normals
-
-
-def _range(depth: Float[np.ndarray, "height width"], seen: Bool[np.ndarray, "height width"]) -> tuple[float, float]:
-    if not seen.any():
-        raise ReconstructionError("the camera sees no object, so there is no depth to save. Look at the report.")
-    near, far = float(depth[seen].min()), float(depth[seen].max())
-    return near, max(far, np.nextafter(np.float32(near), np.float32(np.inf)).item())
 
 
 def _facts(run: StoredRun) -> dict[str, Any]:

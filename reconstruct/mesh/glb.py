@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Integer, UInt8
+from jaxtyping import Float, Integer
 from PIL import Image
 from trimesh.exchange.gltf import export_glb
 from trimesh.visual import TextureVisuals
@@ -12,6 +12,12 @@ from trimesh.visual.material import PBRMaterial
 
 LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
 SAMPLER = {"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP_LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}
+Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x, z, -y of the world
+
+
+def metres(unit: str) -> float:
+    """Return the factor from a run's unit, "mm" | "scene", to glTF's; a scene's own is not converted."""
+    return 1 / 1000.0 if unit == "mm" else 1.0
 
 
 def write_glb(
@@ -33,45 +39,22 @@ def write_glb(
     """
     rgba = np.c_[np.clip(colours, 0, 1), np.ones(len(colours))]
     attributes = {"COLOR_0": np.round(65535 * rgba).astype(np.uint16)}
-    return _packed(vertices, normals, faces, attributes, TextureVisuals(material=_material(metallic, roughness)))
+    return packed(vertices, normals, faces, attributes, TextureVisuals(material=material(metallic, roughness)))
 
 
-def write_textured_glb(
-    vertices: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    tangents: Float[np.ndarray, "n 4"],
-    uv: Float[np.ndarray, "n 2"],
-    faces: Integer[np.ndarray, "m 3"],
-    pictures: tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width 3"]],
-    metal_rough: tuple[float, float],
-) -> bytes:
-    """Return the bytes of a textured GLB.
-
-    Args:
-        vertices: metres, y up.
-        tangents: with w.
-        uv: v down.
-        pictures: base colour, sRGB; and normals in tangent space.
-        metal_rough: as of write_glb.
-    """
-    base, normal_map = map(Image.fromarray, pictures)
-    material = _material(*metal_rough, baseColorTexture=base, normalTexture=normal_map)
-    visual = TextureVisuals(np.column_stack([uv[:, 0], 1 - uv[:, 1]]), material)  # trimesh's v is up
-    return _packed(vertices, normals, faces, {"TANGENT": tangents}, visual)
-
-
-def _material(metallic: float, roughness: float, **pictures: Image.Image) -> PBRMaterial:
+def material(metallic: float, roughness: float, **pictures: Image.Image) -> PBRMaterial:
     """Return a material with its factors: by glTF's defaults it would be bare metal, black without surroundings."""
     return PBRMaterial("object", metallicFactor=metallic, roughnessFactor=roughness, doubleSided=True, **pictures)
 
 
-def _packed(
+def packed(
     vertices: np.ndarray,
     normals: np.ndarray,
     faces: np.ndarray,
     attributes: dict[str, np.ndarray],
     visual: TextureVisuals,
 ) -> bytes:
+    """Return the bytes of a GLB; `attributes` are more of the vertices, by glTF's names."""
     mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=visual, process=False)
     mesh.vertex_attributes |= attributes
 

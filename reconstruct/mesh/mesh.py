@@ -18,7 +18,7 @@ from reconstruct.appearance.brdf import MetalRough, metal_rough
 from reconstruct.fields import SolvedScene
 from reconstruct.mesh.evidence import vertex_evidence
 from reconstruct.mesh.facets import faced, flipped
-from reconstruct.mesh.glb import write_glb
+from reconstruct.mesh.glb import Y_UP, metres, write_glb
 from reconstruct.render.g_buffer import albedo_at, gloss_at, seen_material, surface_maps
 from reconstruct.sdf.grid import SdfGrid
 
@@ -28,7 +28,6 @@ ISLAND_SHARE = 0.01  # of the largest piece's volume: smaller ones are debris,
 SEEN_SHARE = 0.005  # unless a camera sees one in as many of the object's pixels: an ear's tip, a hand, a thin rail
 ROUNDS = 2  # of moving vertices and turning edges: a third changes normals by less than .02 degrees
 OFF_SURFACE = 0.01  # voxels: nodes closer to the surface are moved, because their triangles would have no area
-MM_PER_METRE = 1000.0
 
 Seen = Callable[[], Sequence[Float[np.ndarray, "_ 3"]]]  # where each view's rays meet the object first, world
 Axes = tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"], Float[np.ndarray, " _"]]  # voxels; z from the ground
@@ -243,12 +242,10 @@ def save_mesh(
         )
     with atomic_file(path_ply) as temporary:
         mesh.export(temporary, file_type="ply", vertex_normal=True)
-    scale = 1 / MM_PER_METRE if unit == "mm" else 1.0
-    y_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     if material is None:
         material = MetalRough(torch.from_numpy(decode_srgb(vertex_colours(mesh))), 0.0, 1.0)
     gloss = (material.metallic, material.roughness)
     with atomic_file(path_glb) as temporary:
-        vertices = scale * mesh.vertices @ y_up.T
-        normals = mesh.vertex_normals @ y_up.T
+        vertices = metres(unit) * mesh.vertices @ Y_UP.T
+        normals = mesh.vertex_normals @ Y_UP.T
         temporary.write_bytes(write_glb(vertices, normals, material.base.numpy(), mesh.faces, *gloss))

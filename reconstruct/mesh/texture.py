@@ -4,7 +4,7 @@ Colours of a surface that is still being solved: those of the mean of the photos
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,11 +12,12 @@ import torch
 import trimesh
 import xatlas
 from jaxtyping import Bool, Float, Integer, UInt8
+from PIL import Image
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
-from trimesh.visual import ColorVisuals
+from trimesh.visual import ColorVisuals, TextureVisuals
 
 from calibration.posed_camera import PosedCamera
 from capture.photos.photo import encode_srgb
@@ -24,6 +25,7 @@ from reconstruct.appearance.brdf import MetalRough
 from reconstruct.detail.file import Detail
 from reconstruct.detail.fit import DetailSample, detail_at
 from reconstruct.fields import SolvedScene
+from reconstruct.mesh.glb import Y_UP, material, packed
 from reconstruct.mesh.mesh import mesh_material
 from reconstruct.render.g_buffer import NEIGHBOURS, SAME_POINT, SeenMaterial, albedo_at, seen_material
 
@@ -98,6 +100,21 @@ class TexturedMesh:
     normal_map: UInt8[np.ndarray, "size size 3"]  # tangent space, glTF: x right, y up, z out, (value + 1) / 2
     metallic: float
     roughness: float
+
+    def standing(self, scale: float) -> "TexturedMesh":
+        """Return the mesh y up, `scale` times as large, its base on the origin, where AR viewers put it."""
+        low, high = self.vertices.min(0), self.vertices.max(0)
+        vertices = scale * (self.vertices - np.append(0.5 * (low + high)[:2], low[2])) @ Y_UP.T
+        tangents = np.column_stack([self.tangents[:, :3] @ Y_UP.T, self.tangents[:, 3]])
+        return replace(self, vertices=vertices, normals=self.normals @ Y_UP.T, tangents=tangents)
+
+
+def write_textured_glb(mesh: TexturedMesh) -> bytes:
+    """Return the bytes of a textured GLB of a mesh that stands as glTF wants it: metres, y up."""
+    base, normal_map = Image.fromarray(mesh.base), Image.fromarray(mesh.normal_map)
+    look = material(mesh.metallic, mesh.roughness, baseColorTexture=base, normalTexture=normal_map)
+    visual = TextureVisuals(np.column_stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]]), look)  # trimesh's v is up
+    return packed(mesh.vertices, mesh.normals, mesh.faces, {"TANGENT": mesh.tangents}, visual)
 
 
 def unwrap(

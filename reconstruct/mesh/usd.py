@@ -7,36 +7,26 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Integer, UInt8
 from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
+
+from reconstruct.mesh.texture import TexturedMesh
 
 COLOUR, NORMALS = "colour.png", "normals.png"
 
 
-def write_usdz(
-    path: Path,
-    vertices: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    uv: Float[np.ndarray, "n 2"],
-    faces: Integer[np.ndarray, "m 3"],
-    pictures: tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width 3"]],
-    metal_rough: tuple[float, float],
-) -> None:
+def write_usdz(path: Path, textured: TexturedMesh) -> None:
     """Write a package with one mesh and a UsdPreviewSurface.
 
     Args:
-        vertices: metres, y up.
-        uv: v down.
-        pictures: base colour, sRGB; and normals in tangent space.
-        metal_rough: metallic and roughness of the whole mesh.
+        textured: metres, y up.
 
     Raises:
         OSError: the package cannot be written.
     """
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        for name, picture in zip((COLOUR, NORMALS), pictures, strict=True):
+        for name, picture in zip((COLOUR, NORMALS), (textured.base, textured.normal_map), strict=True):
             Image.fromarray(picture).save(place / name)
         stage = Usd.Stage.CreateNew(str(place / "object.usdc"))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -44,20 +34,22 @@ def write_usdz(
         root = UsdGeom.Xform.Define(stage, "/Object")
         stage.SetDefaultPrim(root.GetPrim())
         mesh = UsdGeom.Mesh.Define(stage, "/Object/Mesh")
-        mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(vertices, np.float32)))
-        mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
-        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces, np.int32).reshape(-1)))
-        mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, np.float32)))
+        mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(textured.vertices, np.float32)))
+        mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(textured.faces), 3, np.int32)))
+        mesh.CreateFaceVertexIndicesAttr(
+            Vt.IntArray.FromNumpy(np.ascontiguousarray(textured.faces, np.int32).reshape(-1))
+        )
+        mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(textured.normals, np.float32)))
         mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
         mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        low, high = vertices.min(0), vertices.max(0)
+        low, high = textured.vertices.min(0), textured.vertices.max(0)
         mesh.CreateExtentAttr([Gf.Vec3f(*map(float, low)), Gf.Vec3f(*map(float, high))])
         coordinates = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
             "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex
         )
-        v_up = np.column_stack([uv[:, 0], 1 - uv[:, 1]]).astype(np.float32)
+        v_up = np.column_stack([textured.uv[:, 0], 1 - textured.uv[:, 1]]).astype(np.float32)
         coordinates.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(v_up)))
-        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(_material(stage, *metal_rough))
+        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(_material(stage, textured.metallic, textured.roughness))
         stage.GetRootLayer().Save()
         if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(place / "object.usdc")), str(path)):
             raise OSError(f"the package {path.name} could not be written")

@@ -23,9 +23,9 @@ from msgspec import Meta, Struct
 from calibration.scenes.importers import OF_A_CAPTURE, importers
 from capture.decode.formats import is_photo_name
 from capture.errors import FOR_STUDIO, CaptureError, Remedy, UserError
-from capture.files.atomic import read_json, write_json
+from capture.files.atomic import write_json
 from capture.files.names import is_clip_name, refuse_no_folder
-from capture.files.schema import FileName, Number, Text, as_type
+from capture.files.schema import FileName, Number, Text, read_as
 from capture.session.session import ROLE_FOLDERS
 from reconstruct.run_folder.lock import LOCK, lock_holder
 from reconstruct.stored_run.documents import MOST_PHOTOS, checked_report
@@ -131,7 +131,9 @@ def make_tasks(
 def run_task(task: Task) -> Outcome:
     """Run one capture, wait for it, and return its Outcome, also if it fails."""
     out = Path(task.out)
-    _wait_until_free(out / task.name)
+    end = time.monotonic() + LEAVING_S  # if the folder is not free then, the run's error names its process
+    while lock_holder(out / task.name / LOCK) is not None and time.monotonic() < end:
+        time.sleep(0.1)
     start, began = time.monotonic(), time.time()
     process = start_task(task)
     try:
@@ -194,13 +196,6 @@ def start_command(
 def log_file(task: Task) -> Path:
     """Return the file for what the run of a task says."""
     return Path(task.out) / LOGS / f"{task.name}.txt"
-
-
-def _wait_until_free(run: Path) -> None:
-    """Wait until the run of a dead worker releases its folder; if it does not, the next run's error names it."""
-    end = time.monotonic() + LEAVING_S
-    while lock_holder(run / LOCK) is not None and time.monotonic() < end:
-        time.sleep(0.1)
 
 
 def why_it_failed(code: int | None, log: Path) -> str:
@@ -309,11 +304,11 @@ def load_outcomes(file: Path) -> dict[str, Outcome]:
     if not file.is_file():
         return {}
     try:
-        rows = as_type(read_json(file), _BatchFile, str(file), "").outcomes
+        rows = read_as(file, _BatchFile, "")[0].outcomes
         rows = [replace(row, report=checked_report(row.report, str(file))) for row in rows]
-    except (OSError, UserError, ValueError) as error:
+    except UserError as error:
         raise CaptureError(
-            f"{file} is not the record of a batch ({error}).", "move it away", Remedy.OTHER_FOLDER
+            f"{file} is not the record of a batch ({str(error).rstrip(' .')}).", "move it away", Remedy.OTHER_FOLDER
         ) from error
     return {row.name: row for row in rows}
 

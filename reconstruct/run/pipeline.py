@@ -19,20 +19,23 @@ A stage that an earlier invocation finished is not repeated: its result is read 
 import platform
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 
+import numpy as np
+import torch
 from PIL import Image
 
 from calibration.calibrated_views import CalibratedViews, load_views, save_views
+from calibration.posed_camera import PosedCamera
 from capture.errors import CaptureError
+from capture.files.atomic import atomic_file
+from capture.files.schema import read_kept
 from capture.files.title import hand_title_on
 from capture.photos.photo import read_thumbnail
-from capture.session.session import FEWEST_LIT
 from reconstruct.check.readiness import refuse_hopeless
 from reconstruct.check.verdict import check_capture
 from reconstruct.fields import SolvedScene, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh
-from reconstruct.run.ball_on_ground import without_ball
 from reconstruct.run.machine import kernels_are_compiled, measure_speed, planned_seconds, whole_seconds, work_of
 from reconstruct.run.presets import solver_config
 from reconstruct.run.report_json import summary, versions
@@ -40,11 +43,11 @@ from reconstruct.run.results import detail_is_asked, save_results, write_detail
 from reconstruct.run.solve_stage import solve
 from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder, content_hash
 from reconstruct.run_folder.forecast import duration_text, plan_numbers
-from reconstruct.run_folder.once import Lazy, once
-from reconstruct.run_folder.progress import log_to
+from reconstruct.run_folder.progress import Lazy, log_to, once
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.backend import backend_name, solver_device
 from reconstruct.source.calibrate_source import calibrate_source, in_millimetres, with_scale_of
-from reconstruct.source.photos import Photos, Plan, keep_spread, memory_plan, read_photos, read_plan
+from reconstruct.source.photos import Photos, Plan, memory_plan, read_photos, within_plan
 from reconstruct.source.source import RunOptions, Source
 from reconstruct.stored_run.maps import THUMBS, thumbnail_name
 from reconstruct.stored_run.stored_run import CALIBRATION, FIELDS
@@ -88,7 +91,10 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
         return
     if source.session is not None and source.ground_is_known(options) and not run.is_finished("solve"):
         once(run, "check", "judging the photos", lambda: _check(source, photos.get(), calibrated.get(), run), photos)
-    once(run, "solve", _fitting(options), fit, photos, FIELDS)
+    compiling = "" if kernels_are_compiled() else "; the first run on a machine takes some 20 s longer"
+    what = "training a field" if options.is_trained() else "fitting the surface"
+    message = f"{what} on {backend_name(solver_device(options.device))}{compiling}"
+    once(run, "solve", message, fit, photos, FIELDS)
     if source.scale(options) is not None and run.is_finished("solve"):
         _keep_scale(source, options, run, calibrated.get(), fields.get())
     calibrated.forget()  # the memory plan may have left out photos
@@ -182,16 +188,9 @@ def _keep_scale(
         save_views(calibrated.with_calibrations(scaled), run.file(CALIBRATION))
 
 
-def _fitting(options: RunOptions) -> str:
-    """Return the progress message of the stage "solve"."""
-    compiling = "" if kernels_are_compiled() else "; the first run on a machine takes some 20 s longer"
-    where = backend_name(solver_device(options.device))
-    return f"{'training a field' if options.is_trained() else 'fitting the surface'} on {where}{compiling}"
-
-
 def _plan(source: Source, options: RunOptions, run: RunFolder) -> Plan | None:
     """Return what fits into memory, decided once for all invocations of a run; None for a trained field."""
-    plan = read_plan(run.file(PLAN))
+    plan = read_kept(run.file(PLAN), Plan)
     if plan is None:
         plan = memory_plan(source, options)
         if plan is not None:
@@ -205,8 +204,7 @@ def _within_memory(source: Source, options: RunOptions, run: RunFolder, calibrat
     if plan is None:
         return calibrated
     before, every = [view.calibration for view in calibrated.views], len(source.photos())
-    most = [plan.photos if len(before) == 1 else plan.photos * len(one.lights) // every for one in before]
-    thinned = [keep_spread(one, max(count, FEWEST_LIT)) for one, count in zip(before, most, strict=True)]
+    thinned = [within_plan(one, plan, every) for one in before]
     used = [[light.used for one in some for light in one.lights] for some in (before, thinned)]
     if used[0] == used[1]:
         return calibrated
@@ -248,5 +246,24 @@ def write_thumbnails(source: Source, run: RunFolder, first: str | None = None) -
     for view in source.views():
         before = "" if view.name == first else f"{view.name}/"
         for photo in view.photos():
-            with run.writing(f"{THUMBS}/{thumbnail_name(before + photo.name)}") as path:
+            with atomic_file(run.file(f"{THUMBS}/{thumbnail_name(before + photo.name)}")) as path:
                 Image.fromarray(read_thumbnail(photo, THUMBNAIL_LONG_SIDE)).save(path, quality=THUMBNAIL_QUALITY)
+
+
+def without_ball(fields: SolvedScene, circle: tuple[float, float, float], posed_camera: PosedCamera) -> SolvedScene:
+    """Return the surface without a ball that stands on the ground.
+
+    Args:
+        circle: x, y, radius of the ball and a rim about it, px of `posed_camera`.
+        posed_camera: in the frame of the fields.
+    """
+    x, y, radius = circle
+    ray, slope = posed_camera.rays(np.array([[x, y]]))[0], radius / posed_camera.camera.fx
+    eye, ground = posed_camera.centre, posed_camera.ground_height
+    t = (eye[2] - ground) / (slope * float(ray @ posed_camera.forward) - ray[2])  # its middle lies a radius above
+    middle, size = eye + t * ray, slope * t * float(ray @ posed_camera.forward)
+    grid = fields.grid
+    nodes = [grid.origin[i].item() + grid.spacing * np.arange(n) - middle[i] for i, n in enumerate(grid.values.shape)]
+    away = np.sqrt(nodes[0][:, None, None] ** 2 + nodes[1][:, None] ** 2 + nodes[2] ** 2)
+    values = torch.maximum(grid.values, torch.from_numpy(size - away).to(grid.values.dtype))
+    return replace(fields, grid=SdfGrid(values, grid.origin, grid.spacing))

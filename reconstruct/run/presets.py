@@ -80,9 +80,3 @@ def shortened(config: FitConfig, share: float) -> FitConfig:
         iterations = max(1, round(share * level.iterations))
         levels.append(replace(level, iterations=iterations, shrink=level.shrink * level.iterations / iterations))
     return replace(config, levels=tuple(levels))
-
-
-def config_from_json(document: dict[str, Any]) -> FitConfig:
-    """Return the FitConfig that was stored as JSON by `dataclasses.asdict`."""
-    levels = tuple(Level(**level | {"rate": tuple(level["rate"])}) for level in document["levels"])
-    return FitConfig(**document | {"levels": levels, "sharpness": tuple(document["sharpness"])})

@@ -18,8 +18,8 @@ import psutil
 from msgspec import Struct
 
 from capture.errors import CaptureError, UserError
-from capture.files.atomic import read_json, write_json
-from capture.files.schema import Count, Number, Text, as_type
+from capture.files.atomic import write_json
+from capture.files.schema import Count, Number, Text, read_as
 from reconstruct.run.batch import PROGRAM, Task, log_file, start_task, why_it_failed
 from reconstruct.run_folder.folder import LOG, read_log
 from reconstruct.run_folder.lock import LOCK, lock_holder, running
@@ -172,11 +172,9 @@ class Queue:
                     self._refuse(job.task)
                 child = start_task(job.task, is_detached=True)
                 self._children[job.id], holder = child, child.pid
-        except UserError as error:
-            self._change(job, state=FAILED, began=time.time(), ended=time.time(), sentence=str(error))
-            return
-        except OSError as error:
-            sentence = f"it could not be started: {error.strerror or error}."
+        except (UserError, OSError) as error:
+            is_refused = isinstance(error, UserError)
+            sentence = str(error) if is_refused else f"it could not be started: {error.strerror or error}."
             self._change(job, state=FAILED, began=time.time(), ended=time.time(), sentence=sentence)
             return
         try:
@@ -205,7 +203,8 @@ class Queue:
     def _write(self, jobs: list[Job]) -> None:
         """Write the file; only then is it so: what could not be written was not asked for."""
         jobs = _in_order(jobs)
-        rows = [asdict(job) | {"task": _row(job.task)} for job in jobs]
+        parts = ("name", "capture", "out", "options")  # of a task
+        rows = [asdict(job) | {"task": {name: getattr(job.task, name) for name in parts}} for job in jobs]
         write_json(self._file, {"format": FORMAT, "jobs": rows})
         self._jobs, self._is_stale = jobs, False
 
@@ -236,16 +235,14 @@ def _end_of(job: Job, code: int | None) -> tuple[str, str]:
         return FAILED, "its output is gone. Start it again."
 
 
-def _row(task: Task) -> dict[str, object]:
-    return {"name": task.name, "capture": task.capture, "out": task.out, "options": list(task.options)}
-
-
 def _load(file: Path, program: tuple[str, ...]) -> list[Job]:
     if not file.is_file():
         return []
     try:
-        jobs = as_type(read_json(file), _QueueFile, str(file), "").jobs
+        jobs = read_as(file, _QueueFile, "")[0].jobs
         threads = psutil.cpu_count() or 1
         return [replace(job, task=replace(job.task, threads=threads, program=program)) for job in jobs]
-    except (OSError, UserError, ValueError) as error:
-        raise CaptureError(f"{file} is not the record of a queue ({error}). Move it away; the runs stay.") from error
+    except UserError as error:
+        raise CaptureError(
+            f"{file} is not the record of a queue ({str(error).rstrip(' .')}). Move it away; the runs stay."
+        ) from error

@@ -12,11 +12,12 @@ import trimesh
 from calibration.board.board_scale import scale_sentence
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
+from capture.files.schema import read_kept
 from reconstruct.fields import SolvedScene
 from reconstruct.mesh.evidence import KINDS, UNCONSTRAINED, volume_sigma
 from reconstruct.run_folder.folder import LOG, PLAN, RunFolder, read_log
 from reconstruct.run_folder.requests import ON_REQUEST
-from reconstruct.source.photos import OVERRIDE, read_plan
+from reconstruct.source.photos import OVERRIDE, Plan
 from reconstruct.source.source import RunOptions, Source
 from reconstruct.stored_run.documents import CHECK, read_check
 
@@ -40,7 +41,7 @@ def summary(
     solved: SolvedScene,
 ) -> dict[str, Any]:
     """Return the content of report.json: costs, photos used and dropped, residuals, versions."""
-    calibration, check, plan = calibrated.first, run.file(CHECK), read_plan(run.file(PLAN))
+    calibration, check, plan = calibrated.first, run.file(CHECK), read_kept(run.file(PLAN), Plan)
     residuals, trial = plain(calibration.residuals), solved.light_trial
     views = {view.name: view.calibration for view in calibrated.every()}
     notes, warnings = (_said(calibrated, key) for key in ("notes", "warnings"))

@@ -1,27 +1,34 @@
 """Stage "solve": build the scene and fit a surface to it, on a schedule that visitors of the page can change.
 
 Carry out requests from visitors of a run's page: pause, next level, stop, another resolution.
+
+Of an object that was laid anew, each pose is solved small on its own, then all are laid together.
 """
 
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from itertools import count
+
+import msgspec
+import torch
 
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
 from capture.errors import ReconstructionError, Remedy
-from capture.files.atomic import read_json
+from capture.files.atomic import atomic_file, read_json
 from capture.files.regular import why
 from reconstruct.config import FitConfig
-from reconstruct.fields import SolvedScene
-from reconstruct.mesh.mesh import preview_mesh
+from reconstruct.fields import SolvedScene, load_fields, save_fields
+from reconstruct.mesh.mesh import extract_mesh, preview_mesh
 from reconstruct.mesh.texture import PhotoColours
+from reconstruct.object_poses.confirmed import confirmed, withheld
+from reconstruct.object_poses.together import PlacedObjectPose, SolvedObjectPose, Together, lay_together
 from reconstruct.run.machine import within_budget, work_of
-from reconstruct.run.object_poses_stage import forget_object_poses, joined_object_poses
-from reconstruct.run.presets import config_from_json, continued, solver_config, training
+from reconstruct.run.presets import continued, preset, solver_config, training
 from reconstruct.run_folder.folder import KEPT, RunFolder
-from reconstruct.run_folder.once import Lazy
+from reconstruct.run_folder.progress import Lazy
 from reconstruct.run_folder.requests import (
     NEXT_LEVEL,
     ON_REQUEST,
@@ -32,22 +39,139 @@ from reconstruct.run_folder.requests import (
     open_requests,
     withdraw,
 )
-from reconstruct.scene import Scene, build_scene
+from reconstruct.scene import Scene, build_scene, reduced
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.trainer import train
 from reconstruct.solve.backend import solver_device, training_device
 from reconstruct.solve.checkpoint import SolveState, load_state, save_state
 from reconstruct.solve.level import Rescheduled
-from reconstruct.solve.solver import SolveReporter, fit_steered
+from reconstruct.solve.solver import SolveReporter, begun, fit, fit_steered, fit_surface
 from reconstruct.source.photos import Photos, read_photos
 from reconstruct.source.source import LONG_SIDES, RunOptions, Source
 from reconstruct.views import Scenes
 
+SMALL = "draft"  # preset of the poses' own solves: enough for how the object was turned
+KEPT_OBJECT_POSE = "checkpoint_object_pose"  # file of a pose's own solve, while the run needs it
+NOT_JOINED = "mesh.ply"  # of a pose that could not be laid on the others, in a folder of its name
+
+ObjectPoses = tuple[tuple[str, Scenes], ...]  # name and scenes of each further pose, in its own world
 LOOK_EVERY_S = 0.25  # while paused
 Continued = Callable[[FitConfig, int, str], FitConfig | None]  # schedule, levels done, preset: see presets.continued
 EARLIER = "checkpoint_earlier.safetensors"  # state of a solve when a visitor of the page chose another resolution
 RESOLUTION = "resolution"  # key of config.json: the preset that was chosen then
+
+
+def joined_object_poses(
+    scenes: Scenes,
+    object_poses: ObjectPoses,
+    config: FitConfig,
+    run: RunFolder,
+    report: SolveReporter,
+    device: torch.device | None,
+) -> tuple[Scenes, SolveState | None, tuple[str, ...]]:
+    """Return the scenes of all poses that can be laid together, the state that their solve begins with, and doubts.
+
+    Raises:
+        ReconstructionError: the first pose cannot be solved.
+    """
+    if not (object_poses and scenes[0].ground_known):
+        return scenes, None, ()
+    together = _SmallSolves(run, report, device, config.seed).laid_together(scenes, object_poses)
+    scenes, doubts = joined_scenes(scenes, object_poses, together.placed), tuple(text for _, text in together.refused)
+    start = begun(together.start, min(1, len(config.levels) - 1), scenes) if together.placed else None
+    return scenes, start, doubts
+
+
+def joined_scenes(scenes: Scenes, object_poses: ObjectPoses, placed: tuple[PlacedObjectPose, ...]) -> Scenes:
+    """Return the scenes of the first pose and of all that were placed, these with the motion to the first."""
+    motions = {one.name: one.motion for one in placed}
+    moved = [replace(s, object_from_world=motions[name]) for name, own in object_poses if name in motions for s in own]
+    return (*scenes, *moved)
+
+
+def forget_object_poses(run: RunFolder) -> None:
+    """Remove the files of the poses' own solves."""
+    for path in run.path.glob(f"{KEPT_OBJECT_POSE}_*"):
+        run.discard(path.name)
+
+
+@dataclass(frozen=True)
+class _SmallSolves:
+    """Small solves of poses, kept in the run folder, so that a run that was stopped does not repeat them."""
+
+    run: RunFolder
+    report: SolveReporter
+    device: torch.device | None
+    seed: int
+
+    def laid_together(self, scenes: Scenes, object_poses: ObjectPoses) -> Together:
+        """Solve the first pose's scenes and each further pose's, and find how these lie in the world of the first.
+
+        A pose that cannot be solved or placed is named in the result's `refused`; if it was solved, its own mesh is
+        written.
+
+        Raises:
+            ReconstructionError: the first pose cannot be solved.
+            OSError: a file cannot be written.
+        """
+        solved, refused = [], []
+        for number, (name, own) in enumerate((("", scenes), *object_poses)):
+            small = tuple(reduced(scene, LONG_SIDES[SMALL]) for scene in own)
+            try:
+                solved.append(SolvedObjectPose(name, small, self._alone(withheld(small, self.seed), name, number)))
+            except ReconstructionError as error:
+                if not name:
+                    raise
+                refused.append((name, f"{name} is left out: {error}"))
+        together = lay_together(tuple(solved), self.seed, self.run.activity)
+        for one in together.placed:
+            self.run.progress(message=one.sentence())
+        known = tuple((one.name, withheld(one.scenes, self.seed)) for one in solved)
+        attempts = count()
+
+        def solve(placed: tuple[PlacedObjectPose, ...], start: SdfGrid) -> SdfGrid:
+            return self._all(joined_scenes(known[0][1], known[1:], placed), start, next(attempts))
+
+        together = confirmed(solved, together, solve, self.seed, lambda text: self.run.progress(message=text))
+        for name, sentence in together.refused:
+            refused.append((name, f"{sentence} What it shows is left out; its own surface is in {name}/{NOT_JOINED}."))
+            alone = next(one.fields for one in solved if one.name == name)
+            with atomic_file(self.run.file(f"{name}/{NOT_JOINED}")) as mesh:
+                extract_mesh(alone).export(mesh, file_type="ply")
+        for _, sentence in refused:
+            self.run.progress(message=sentence)
+        return replace(together, refused=tuple(refused))
+
+    def _alone(self, scenes: Scenes, name: str, number: int) -> SolvedScene:
+        """Return a pose's own solve, from its file if there is one."""
+        path = self.run.file(f"{KEPT_OBJECT_POSE}_{number}.safetensors")
+        if path.is_file():
+            return load_fields(path)
+        _, config = preset(SMALL, self.seed)
+        called = f"{name or 'the first object pose'}, small"
+        say = lambda text: self.run.activity(f"{called}: {text}")  # noqa: E731
+        found = fit(scenes, config, _part(called, self.report), device=self.device, say=say)
+        save_fields(found, path)
+        return found
+
+    def _all(self, scenes: Scenes, start: SdfGrid, attempt: int) -> SdfGrid:
+        """Return the small surface of the first pose and those that were placed; no trial of lights."""
+        _, config = preset(SMALL, self.seed)
+        path = self.run.file(f"{KEPT_OBJECT_POSE}_all_{attempt}.safetensors")
+        earlier, part = begun(start, len(config.levels) - 1, scenes), _part("all object poses, small", self.report)
+        return fit_surface(scenes, config, part, path, self.device, earlier, self.run.activity)
+
+
+def _part(called: str, report: SolveReporter) -> SolveReporter:
+    """Return a callback that reports a small solve as a part of what precedes the solve of all."""
+
+    def part(
+        *, stage: str, done: int, total: int, message: str, numbers: dict[str, float], surface: SdfGrid | None
+    ) -> None:
+        report(stage="hull", done=done, total=total, message=f"{called}: {message}", numbers={}, surface=None)
+
+    return part
 
 
 class RequestSteering:
@@ -68,7 +192,7 @@ class RequestSteering:
         self._run.activity("")
         while PAUSE in (asked := open_requests(self._run.path)) and STOP not in asked:
             time.sleep(LOOK_EVERY_S)
-        self._run.idle(time.monotonic() - start)
+        self._run.idle_s += time.monotonic() - start
         self._run.remark("going on")
 
     def is_stopped(self) -> bool:
@@ -168,7 +292,7 @@ def solve(
         save_state(solved.state, json.dumps(asdict(solved.config)), run.file(EARLIER))  # the change takes effect
         run.write_json("config.json", asdict(solved.config) | {RESOLUTION: solved.resolution})  # with this file
     if steering.was_stopped:
-        run.leave_open()
+        run.is_left_open = True
     else:
         forget_object_poses(run)
     run.reopen("mesh", "detail")  # of a surface that was stopped earlier
@@ -204,7 +328,7 @@ def schedule(options: RunOptions, run: RunFolder, source: Source) -> tuple[str, 
         if kept and (options.time_budget is not None or resolution != options.preset):
             if resolution not in LONG_SIDES:
                 raise ValueError(f"the resolution {resolution!r}")
-            return resolution, config_from_json(kept)
+            return resolution, msgspec.convert(kept, FitConfig)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise ReconstructionError(
             f"{path} holds no settings of a solver ({why(error)}).", Remedy.START_AGAIN, Remedy.OTHER_FOLDER
@@ -227,7 +351,7 @@ def _reporter(run: RunFolder, scene: Scene) -> SolveReporter:
         mesh = None if surface is None else preview_mesh(surface, scene.ground_height)
         mesh = None if mesh is None else colours.get().coloured(mesh)
         if mesh is not None and stage == "hull":
-            with run.writing("hull.ply") as path:
+            with atomic_file(run.file("hull.ply")) as path:
                 mesh.export(path)
         run.progress(stage, done, total, message, losses, mesh)
 

@@ -98,10 +98,10 @@ class RunFolder:
         self._made_with: dict[str, Any] = {}
         self._before: set[str] | None = None  # names that existed already; None: the folder did not exist
         self._stage = ""
-        self._is_left_open = False
+        self.is_left_open = False  # True: the next invocation continues the current stage, whose files are not final
         self._stage_start, self._stage_first = 0.0, 0.0  # when it began (or was resumed), and at which step
         self._t0, self._cpu0 = time.monotonic(), cpu_seconds()
-        self._idle_s = 0.0  # seconds that passed in pauses
+        self.idle_s = 0.0  # seconds that passed in pauses; they are not counted as the run's time
         self._counts = 0, 0  # of the last line: done, total
 
     def __enter__(self) -> "RunFolder":
@@ -138,12 +138,6 @@ class RunFolder:
     def file(self, name: str) -> Path:
         """Return the path of a result in this folder."""
         return self.path / name
-
-    @contextmanager
-    def writing(self, name: str) -> Iterator[Path]:
-        """Yield a temporary path that becomes the result `name` if the block succeeds."""
-        with atomic_file(self.path / name) as temporary:
-            yield temporary
 
     def write_json(self, name: str, value: Any) -> None:
         """Write a JSON result atomically."""
@@ -207,15 +201,6 @@ class RunFolder:
                 self._manifest["finished"].remove(stage)
         self.write_json(MANIFEST, self._manifest)
 
-    @property
-    def is_left_open(self) -> bool:
-        """True if the next invocation continues the current stage."""
-        return self._is_left_open
-
-    def leave_open(self) -> None:
-        """Let the next invocation continue the current stage: its files are valid results, but not final."""
-        self._is_left_open = True
-
     def is_finished(self, stage: str) -> bool:
         """Return True if an earlier invocation of the same run completed this stage."""
         return stage in self._manifest.get("finished", [])
@@ -231,7 +216,7 @@ class RunFolder:
         """
         earlier = self._logged_cost(name)
         start, cpu_start = self._now(), cpu_seconds()
-        self._stage, self._stage_start, self._stage_first, self._is_left_open = name, start, 0.0, False
+        self._stage, self._stage_start, self._stage_first, self.is_left_open = name, start, 0.0, False
         with PeakMemory() as memory:
             self.progress(message=message or name)
             yield
@@ -243,7 +228,7 @@ class RunFolder:
         self.progress(name, done=1, total=1, message="done")
         if self._manifest:
             self._manifest["costs"] = {k: asdict(v) for k, v in self.costs.items()}
-            if leaves_files and not self._is_left_open and not self.is_finished(name):
+            if leaves_files and not self.is_left_open and not self.is_finished(name):
                 self._manifest["finished"].append(name)
                 self._manifest["made_with"][name] = self._made_with
             self.write_json(MANIFEST, self._manifest)
@@ -281,7 +266,7 @@ class RunFolder:
             {k: float(v) for k, v in (numbers or {}).items()},
         )
         if preview_mesh is not None:
-            with self.writing("preview.ply") as path:
+            with atomic_file(self.file("preview.ply")) as path:
                 preview_mesh.export(path)
         with (self.path / LOG).open("a", encoding="utf-8") as file:
             file.write(json.dumps(asdict(line)) + "\n")
@@ -297,15 +282,11 @@ class RunFolder:
         if self._on_activity:
             self._on_activity(sentence)
 
-    def idle(self, seconds: float) -> None:
-        """Record seconds that the run waited; they are not counted as its time."""
-        self._idle_s += seconds
-
     # --- inside ------------------------------------------------------------------------------------------------------
 
     def _now(self) -> float:
         """Return the time (s) of a clock that stops during pauses."""
-        return time.monotonic() - self._idle_s
+        return time.monotonic() - self.idle_s
 
     def _log_end(self, error: BaseException) -> None:
         """Log the last line of a run that ends by an error: kind and message, and for a program fault its location."""

@@ -1,25 +1,17 @@
-"""Connect the progress of exports and films, and what packages log of their steps, to a progress display."""
+"""Stages that are done once: a later invocation of the same run reads their results back when needed.
+
+What packages log of their steps, for a progress display.
+"""
 
 import logging
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any, Generic, TypeVar
 
-from reconstruct.export.export import OnProgress
-from reconstruct.run_folder.folder import Progress
+from reconstruct.run_folder.folder import RunFolder
 
-
-def progress(stage: str, show: Callable[[Progress], object]) -> OnProgress:
-    """Return a callback that shows n of m and the time left as steps of a stage."""
-    begin = time.monotonic()
-
-    def on_progress(done: int, total: int, message: str) -> None:
-        passed = time.monotonic() - begin
-        eta = passed * (total - done) / done if done else None
-        show(Progress(passed, time.process_time(), stage, done, total, eta, message))
-
-    return on_progress
+T = TypeVar("T")
 
 
 class _Told(logging.Handler):
@@ -51,3 +43,48 @@ def log_to(package: str, say: Callable[[str], None], warn: Callable[[str], None]
         yield
     finally:
         logger.removeHandler(handler)
+
+
+class Lazy(Generic[T]):
+    """A lazy value: made at its first use, and then kept."""
+
+    def __init__(self, make: Callable[[], T]):
+        self._make, self._made = make, list[T]()
+
+    def get(self) -> T:
+        """Return the value."""
+        if not self._made:
+            self._made.append(self._make())
+        return self._made[0]
+
+    def forget(self) -> None:
+        """Drop the value; it is made again at its next use."""
+        self._made.clear()
+
+
+def once(
+    run: RunFolder,
+    stage: str,
+    message: str,
+    do: Callable[[], Any],
+    needs: Lazy[Any] | None = None,
+    leaves: str | None = None,
+) -> bool:
+    """Do a stage unless an earlier invocation finished it; return True if it was done now.
+
+    A result is read back from its file, so that an interrupted and an uninterrupted run continue from the same numbers.
+
+    Args:
+        message: the log's message while the stage runs.
+        needs: a value that is made in its own stage, before this stage begins.
+        leaves: the file of its result: one that somebody removed is made again.
+    """
+    if leaves is not None and not run.file(leaves).exists():
+        run.reopen(stage)
+    if run.is_finished(stage):
+        return False
+    if needs is not None:
+        needs.get()
+    with run.stage(stage, message):
+        do()
+    return True

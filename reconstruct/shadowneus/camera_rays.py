@@ -94,9 +94,15 @@ def find_hits(field: SdfField, rays: CameraRays, bound: float, steps: int, with_
     found, first = enters.any(1), enters.float().argmax(1)
     hit = rays.ground_t.clone()
     chosen = found.nonzero()[:, 0]
-    low = t[chosen, first[chosen]]
-    high = t[chosen, first[chosen] + 1]
-    hit[chosen] = _bisect(field, rays, chosen, low, high)
+    low = t[chosen, first[chosen]]  # outside
+    high = t[chosen, first[chosen] + 1]  # inside
+    width = float((high - low).max()) if len(low) else 0.0
+    while width > TOLERANCE:
+        middle = 0.5 * (low + high)
+        outside = values(field, rays.eye + middle[:, None] * rays.directions[chosen]) > 0
+        low, high = torch.where(outside, middle, low), torch.where(outside, high, middle)
+        width /= 2
+    hit[chosen] = 0.5 * (low + high)
     return Hits(hit, found, edge)
 
 
@@ -114,17 +120,6 @@ def _first_edge(field: SdfField, rays: CameraRays, t: Tensor, sdf: Tensor) -> tu
     exact = values(field, rays.at(at))
     is_edge = passes.any(1) & (exact.abs() < 0.5 * rays.pixel_angle * at)
     return torch.where(is_edge, at, torch.inf), torch.where(is_edge, place[:, 0] + 1, 0)
-
-
-def _bisect(field: SdfField, rays: CameraRays, chosen: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Find the zeros between low (outside) and high (inside), to TOLERANCE."""
-    width = float((high - low).max()) if len(low) else 0.0
-    while width > TOLERANCE:
-        middle = 0.5 * (low + high)
-        outside = values(field, rays.eye + middle[:, None] * rays.directions[chosen]) > 0
-        low, high = torch.where(outside, middle, low), torch.where(outside, high, middle)
-        width /= 2
-    return 0.5 * (low + high)
 
 
 def expected_depth(

@@ -3,8 +3,7 @@
 import dataclasses
 from dataclasses import dataclass, replace
 
-from reconstruct.shadowneus.field import HashLevels
-from reconstruct.shadowneus.mlp_field import Network
+from reconstruct.shadowneus.field import HashLevels, Network
 
 ABLATIONS: dict[str, dict[str, bool | str]] = {  # what each changes of a TrainConfig
     "intersection": {"use_moved_intersection": False},

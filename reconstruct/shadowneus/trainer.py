@@ -22,9 +22,15 @@ from reconstruct.scene import Scene
 from reconstruct.shadowneus.camera_rays import CameraRays, find_hits
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.model import Model
-from reconstruct.shadowneus.train_pixels import TrainPixels, make_train_pixels
+from reconstruct.shadowneus.train_pixels import (
+    TrainPixels,
+    UnitFrame,
+    make_train_pixels,
+    object_frame,
+    read_onto_grid,
+    unit_height,
+)
 from reconstruct.shadowneus.train_step import losses
-from reconstruct.shadowneus.unit_frame import UnitFrame, object_frame, read_onto_grid, unit_height
 from reconstruct.solve.checkpoint import FINGERPRINT, FORMAT, Log, fingerprint, read_checkpoint, write_checkpoint
 from reconstruct.solve.level import Steering
 from reconstruct.solve.solver import NO_STEERING, SolveReporter
@@ -169,7 +175,8 @@ def iterations(
         terms = losses(model, view, config, i, generator)
         optimiser.zero_grad(set_to_none=True)
         torch.stack(list(terms.values())).sum().backward()
-        failures = 0 if _is_finite(model) else failures + 1
+        gradients = [p.grad.abs().sum() for p in model.parameters() if p.grad is not None]
+        failures = 0 if bool(torch.stack(gradients).isfinite().all()) else failures + 1
         if not failures:
             optimiser.step()
         else:
@@ -219,8 +226,3 @@ def _albedo(model: Model, view: TrainPixels, config: TrainConfig) -> Float[Tenso
         albedo, _ = model.materials(points, normals, model.field.features(points))
         out.append(torch.where(hits.t.isfinite()[:, None], albedo, 0.0).cpu())
     return torch.cat(out).reshape(*view.scene.directions.shape[:2], 3)
-
-
-def _is_finite(model: Model) -> bool:
-    gradients = [p.grad for p in model.parameters() if p.grad is not None]
-    return bool(torch.stack([g.abs().sum() for g in gradients]).isfinite().all())

@@ -17,10 +17,9 @@ from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
 from calibration.views.calibrate_views import ViewPhotos, calibrate_views
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
-from capture.session.session import FEWEST_LIT
 from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import surface_maps
-from reconstruct.source.photos import Photos, keep_spread
+from reconstruct.source.photos import Photos, within_plan
 from reconstruct.source.source import RunOptions, Source, ground_option
 
 UNKNOWN_SCALE = "scale: "  # beginning of the note that the given length replaces
@@ -53,18 +52,13 @@ def in_millimetres(fields: SolvedScene, length: float, ground_is_known: bool) ->
 
 def with_scale_of(calibration: Calibration, fields: SolvedScene, length: float, ground_is_known: bool) -> Calibration:
     """Return the calibration in the unit of a scaled scene, whose camera is the same, with a note on the length."""
-    factor = _height(fields.world_from_camera.translation, fields.ground_height) / _height(
-        calibration.world_from_camera.translation, calibration.ground_height
-    )
+    now, before = (float(x.world_from_camera.translation[2]) - x.ground_height for x in (fields, calibration))
+    factor = now / before
     scaled = calibration.scaled(factor, fields.unit)
     what = "height above the ground" if ground_is_known else "largest extent across the picture"
     note = f"scale: the object's {what} is {length:g} mm, as given; one unit of the files was {factor:.4g} mm"
     notes = [text for text in scaled.residuals.get("notes", []) if not text.startswith(UNKNOWN_SCALE)]
     return replace(scaled, residuals=scaled.residuals | {"notes": [*notes, note]})
-
-
-def _height(place: np.ndarray, ground: float) -> float:
-    return float(place[2]) - ground
 
 
 def calibrate_source(source: Source, photos: Sequence[Photos], options: RunOptions) -> CalibratedViews:
@@ -85,15 +79,12 @@ def calibrate_source(source: Source, photos: Sequence[Photos], options: RunOptio
     views = _calibrated(source, photos, options)
     plan = next((one.plan for one in photos if one.error is None), None)
     has_scale, is_known = source.scale(options) is not None, source.ground_is_known(options)
-    is_one, every = len(source.views()) == 1, len(source.photos())
+    every = len(source.photos())
 
     def finished(calibration: Calibration) -> Calibration:
         calibration = with_ground(calibration, options.ground, is_known, has_scale)
         calibration = with_light_error(calibration, options.light_error)
-        if plan is None:
-            return calibration
-        share = 1.0 if is_one else len(calibration.lights) / every
-        return keep_spread(calibration, plan.photos if is_one else max(FEWEST_LIT, int(share * plan.photos)))
+        return calibration if plan is None else within_plan(calibration, plan, every)
 
     def all_finished(some: CalibratedViews) -> CalibratedViews:
         return some.with_calibrations([finished(view.calibration) for view in some.views])

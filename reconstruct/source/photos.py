@@ -9,22 +9,23 @@ the finished surface, which are as large as a photo. Measured on runs of two cor
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 
 from calibration.calibration import Calibration
 from calibration.known_scene import KnownScene
-from calibration.scenes.ground_depth import read_ground_depth
+from calibration.scenes.shadowneus import read_ground_depth
 from capture.checks.check_stack import check_and_register, register, white_balance_finding
 from capture.decode.formats import read_size
 from capture.errors import CaptureError
-from capture.files.atomic import read_json
 from capture.photos.finding import Finding, keep_findings, kept_findings
 from capture.photos.photo import PhotoStack, read_alpha, read_grey, read_stack
 from capture.photos.radiometry import with_one_white_balance, without_ambient
-from capture.session.session import Session
+from capture.session.session import FEWEST_LIT, Session
 from reconstruct.labels.outline import bright_object
 from reconstruct.run_folder.forecast import memory_room
 from reconstruct.source.source import AUTO, CALIBRATION_LONG_SIDE, LONG_SIDES, RunOptions, Source
@@ -45,15 +46,16 @@ SHORT = ". This machine may run out of it: close other programs, or give fewer p
 OVERRIDE = "another memory limit changes this"
 TOO_MANY = "left out: so many photos do not fit into memory, and the lights of others are spread more evenly"
 SAME_SHAPE = 0.02  # of the ratio of the sides: sizes are rounded to pixels
+Positive = Annotated[int, Meta(gt=0)]
 
 
 @dataclass(frozen=True)
 class Plan:
     """The photos and pixels that the solver will use, and a sentence with the reason."""
 
-    photos: int
-    long_side: int  # px of the solver's pictures
-    predicted: int  # bytes at the peak
+    photos: Positive
+    long_side: Positive  # px of the solver's pictures
+    predicted: Positive  # bytes at the peak
     sentence: str
 
 
@@ -103,16 +105,6 @@ def plan_for(photos: int, width: int, height: int, preset: str, room: float) -> 
     return Plan(count, side, now, f"{said}: {result}")
 
 
-def read_plan(path: Path) -> Plan | None:
-    """Return the plan that an earlier invocation of a run made, or None."""
-    try:
-        plan = Plan(**read_json(path))
-    except (OSError, ValueError, TypeError):
-        return None
-    is_well = all(type(x) is int and x > 0 for x in (plan.photos, plan.long_side, plan.predicted))
-    return plan if is_well and isinstance(plan.sentence, str) else None
-
-
 def keep_spread(calibration: Calibration, count: int) -> Calibration:
     """Keep at most `count` photos in use, whose lights are farthest apart; the others store why they are not used.
 
@@ -131,6 +123,12 @@ def keep_spread(calibration: Calibration, count: int) -> Calibration:
         kept = {names[i] for i in chosen}
         lights = [replace(x, used=False, reason=TOO_MANY) if x.used and x.photo not in kept else x for x in lights]
     return replace(calibration, lights=tuple(lights))
+
+
+def within_plan(calibration: Calibration, plan: Plan, every: int) -> Calibration:
+    """Return the calibration of a view with its share of the photos that fit in use, of `every` photo of all views."""
+    share = max(FEWEST_LIT, plan.photos * len(calibration.lights) // every)
+    return keep_spread(calibration, min(share, plan.photos))
 
 
 @dataclass(frozen=True)

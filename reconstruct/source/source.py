@@ -13,9 +13,9 @@ from calibration.board.corners import grey_of
 from calibration.board.recognise import board_finder, guess_board
 from calibration.calibrate import WAYS
 from calibration.known_scene import KnownScene
-from calibration.scenes.ground_depth import find_ground_depth
 from calibration.scenes.importers import find_importer
 from calibration.scenes.listed_lights import load_listed, load_with_ball, why_unused
+from calibration.scenes.shadowneus import find_ground_depth
 from capture.errors import CalibrationError, CaptureError, Remedy, UserError
 from capture.files.names import clip_of, refuse_no_folder
 from capture.photos.finding import Finding

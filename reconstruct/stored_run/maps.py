@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from capture.decode.formats import LARGEST_WHOLE
-from capture.decode.small_picture import read_small_picture
+from capture.decode.pictures import read_small_picture
 from capture.errors import CaptureError, ReconstructionError
 from capture.files.arrays import parse_npy
 from capture.files.regular import is_own_folder, is_regular, read_regular
-from reconstruct.stored_run.refusal import refusal
+from reconstruct.stored_run.documents import refusal
 
 DEPTH, NORMALS, MASK, THUMBS = "depth.npy", "normal.npy", "mask.png", "thumbs"
 LARGEST_FILE = 1 << 30  # bytes

@@ -9,7 +9,7 @@ from jaxtyping import Float32, Int32, UInt8
 
 from capture.errors import ReconstructionError
 from capture.files.regular import open_regular
-from reconstruct.stored_run.refusal import refusal
+from reconstruct.stored_run.documents import refusal
 
 if TYPE_CHECKING:  # it takes half a second to import, and most commands read no mesh
     import trimesh

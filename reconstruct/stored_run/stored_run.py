@@ -98,7 +98,7 @@ class StoredRun:
     def mesh(self) -> "trimesh.Trimesh":
         """mesh.ply: world frame, sRGB colours and normals per vertex."""
         mesh = read_mesh(self.run_dir / MESH)
-        refuse_far_mesh(mesh, self.fields, self.run_dir)
+        _refuse_far(np.asarray(mesh.bounds), self.fields, f"{self.run_dir / MESH}: the mesh")
         return mesh
 
     @cached_property
@@ -141,15 +141,6 @@ def refuse_elsewhere(calibration: Calibration, fields: "SolvedScene", run_dir: P
     for light in calibration.lights:
         if light.used and light.position is not None:
             _refuse_far(light.position[None], fields, f"{run_dir / CALIBRATION}: the light of {light.photo!r:.80}")
-
-
-def refuse_far_mesh(mesh: "trimesh.Trimesh", fields: "SolvedScene", run_dir: Path) -> None:
-    """Check that mesh.ply lies where fields.safetensors does.
-
-    Raises:
-        ReconstructionError: it does not.
-    """
-    _refuse_far(np.asarray(mesh.bounds), fields, f"{run_dir / MESH}: the mesh")
 
 
 def _refuse_far(places: np.ndarray, fields: "SolvedScene", what: str) -> None:

@@ -16,7 +16,7 @@ import viser
 from capture.files.title import title_of
 from reconstruct.run.bundle import user_name
 from reconstruct.run_folder.forecast import give_memory_back, share_memory_among_threads
-from reconstruct.stored_run.refusal import refuse_no_run
+from reconstruct.stored_run.documents import refuse_no_run
 from viewer.page.guard import GuardedServer, is_loopback
 from viewer.page.page import Page
 from viewer.stage.files import StageFiles

@@ -14,7 +14,7 @@ from capture.photos.photo import encode_srgb, read_photo
 from reconstruct.check.light_coverage import ShadowCover, side_in_words
 from reconstruct.check.verdict import CaptureCheck
 from viewer.report import document as doc
-from viewer.report.drawing import enlarged
+from viewer.report.document import enlarged
 from viewer.report.figures import coverage, lights_from_above
 
 PAGE = "check.html"
@@ -69,10 +69,8 @@ def _shadows(checked: CaptureCheck) -> list[str]:
     """Return the section of shadows on the ground; none where no ground is known."""
     if "light_spread" in checked.readiness.facts:
         return []
-    cover = checked.cover
     about = "Shadows on the ground carry the shape of sides that the camera does not see."
-    figure = doc.figure(enlarged(shadow_picture(cover), PICTURE_WIDTH), _shadow_caption(cover))
-    return [doc.section("Shadows", about, figure)]
+    return [doc.section("Shadows", about, _shadow_figure(checked.cover))]
 
 
 def _shading_numbers(facts: dict[str, Any]) -> list[tuple[str, str]]:
@@ -118,11 +116,12 @@ def shadow_picture(cover: ShadowCover) -> UInt8[np.ndarray, "height width 3"]:
     return np.round(np.where(cover.mask[..., None], grey, shown)).astype(np.uint8)
 
 
-def _shadow_caption(cover: ShadowCover) -> str:
-    return (
+def _shadow_figure(cover: ShadowCover) -> str:
+    caption = (
         "How often each place on the ground lay in shadow: yellow once, violet in half of the photos. "
         f"The shadow leaves the picture in {int(cover.cut.sum())} of {len(cover.cut)} photos."
     )
+    return doc.figure(enlarged(shadow_picture(cover), PICTURE_WIDTH), caption)
 
 
 def _phone_back(checked: CaptureCheck) -> list[str]:
@@ -170,7 +169,7 @@ def _further(checked: CaptureCheck) -> str:
             coverage(checked.calibration, checked.cover.centre),
             "From the object: overhead is in the middle",
         ),
-        doc.figure(enlarged(shadow_picture(checked.cover), PICTURE_WIDTH), _shadow_caption(checked.cover)),
+        _shadow_figure(checked.cover),
     )
     return doc.section(checked.name, "Another place of the tripod.", pictures + _photo_table(checked))
 

@@ -21,7 +21,7 @@ from reconstruct.render.relight import photographed, shadow_picture, with_refine
 from reconstruct.stored_run.maps import Maps, thumbnail_name
 from viewer.display.run_follower import size_text
 from viewer.report import document as doc
-from viewer.report.drawing import Picture, depth_picture, difference_picture, mesh_picture, normal_picture, reduced
+from viewer.report.document import Picture, depth_picture, difference_picture, mesh_picture, normal_picture, reduced
 
 BRIGHT_ENOUGH = 0.02  # linear: pixels above it are used to compare brightness
 BLACK_OR_WHITE = 12  # of 255 from either end: JPEG error of a shadow picture, except at edges

@@ -13,15 +13,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from calibration.camera import FIELD_MARGIN
 from calibration.light import Light
 from calibration.pose import Pose
 from capture.errors import UserError
 from capture.photos.photo import decode_srgb
 from reconstruct.appearance.brdf import MATERIALS, SHARPNESS, facing_reflectances
 from reconstruct.export.export import UNIT_WORDS
-from reconstruct.export.first_view import LAMP, SKY
-from reconstruct.export.stage_scene import FULL_WEIGHT, GROUND_HALF, StageScene
+from reconstruct.export.stage_scene import FULL_WEIGHT, GROUND_HALF, LAMP, SKY, StageScene
 from reconstruct.fields import SolvedScene
 from reconstruct.render.studio import KEY_DISTANCE, LAMP_RADII, Studio, direction_of, looking_at, towards
 from reconstruct.stored_run.stage_pack import FORMAT
@@ -49,8 +47,6 @@ def camera_facts(seen: SolvedScene, studio: Studio) -> dict[str, Any]:
     """
     camera, pose = seen.camera, seen.world_from_camera
     pose = pose if seen.object_from_world is None else seen.object_from_world @ pose
-    right, low = camera.width - 1.0, camera.height - 1.0
-    corners = camera.unproject(np.array([[0.0, 0.0], [right, 0.0], [0.0, low], [right, low]]))
     offset = pose.translation - studio.centre
     azimuth, elevation = direction_of(offset)
     if elevation > STRAIGHT_DOWN:
@@ -63,7 +59,7 @@ def camera_facts(seen: SolvedScene, studio: Studio) -> dict[str, Any]:
         "middle": [(camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height],
         "distortion": list(camera.distortion),
         "fisheye": camera.fisheye,
-        "field": FIELD_MARGIN * float(np.hypot(corners[:, 0], corners[:, 1]).max()),
+        "field": camera.field,
         "size": [camera.width, camera.height],
         "home": {"azimuth": azimuth, "elevation": elevation, "distance": float(np.linalg.norm(offset))},
     }
@@ -145,7 +141,13 @@ def stage_facts(
         "cameras": [camera_facts(seen, studio) for seen in fields.views()],
         "outline": outline_points((scene.vertices - studio.centre) / studio.radius).tolist(),
         "first": first_window(scene.vertices, fields, studio),
-        "lamp": _lamp(lamp, studio),
+        "lamp": {
+            "azimuth": float(lamp[0]),
+            "elevation": float(lamp[1]),
+            "distance": KEY_DISTANCE * studio.radius,
+            "radius": LAMP_RADII * studio.radius,
+            "strength": LAMP,
+        },
         "largestLamp": LARGEST_LAMP * studio.radius,
         "ambient": SKY,
         "lights": light_facts(run, studio),
@@ -195,16 +197,6 @@ def first_window(vertices: Float[np.ndarray, "n 3"], fields: SolvedScene, studio
     low, high = slopes.min(0), slopes.max(0)
     middle, half = (low + high) / 2, FIRST_MARGIN * (high - low).max() / 2
     return [*(middle - half).tolist(), *(middle + half).tolist()]
-
-
-def _lamp(lamp: tuple[float, float], studio: Studio) -> dict[str, float]:
-    return {
-        "azimuth": float(lamp[0]),
-        "elevation": float(lamp[1]),
-        "distance": KEY_DISTANCE * studio.radius,
-        "radius": LAMP_RADII * studio.radius,
-        "strength": LAMP,
-    }
 
 
 def _gloss(fields: SolvedScene, scene: StageScene) -> dict[str, Any] | None:

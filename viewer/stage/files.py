@@ -6,8 +6,7 @@ from pathlib import Path
 
 from capture.errors import UserError
 from capture.files.regular import read_regular
-from reconstruct.export.export import as_one_file, default_file, export
-from reconstruct.export.formats import FORMATS
+from reconstruct.export.export import FORMATS, as_one_file, default_file, export
 from reconstruct.stored_run.stage_document import STAGE
 from reconstruct.stored_run.stage_pack import StagePack
 from reconstruct.stored_run.stored_run import FIELDS, MESH

@@ -15,13 +15,11 @@ import numpy as np
 from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_file
 from capture.files.title import title_of
-from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, OnProgress
-from reconstruct.export.formats import FORMATS, Format
+from reconstruct.export.export import FORMATS, UNIT_WORDS, Contents, ExportOptions, Format, OnProgress
 from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
 from reconstruct.stored_run.stage_pack import STAGE_PACK, StagePack, addressed, marks_of, read_stage_pack
 from reconstruct.stored_run.stored_run import FIELDS, MESH, StoredRun
-from viewer.report.document import hash_of
-from viewer.report.drawing import as_address
+from viewer.report.document import as_address, hash_of
 
 SCRIPTS = (
     "vectors",

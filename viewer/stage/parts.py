@@ -8,13 +8,12 @@ from jaxtyping import Float, Shaped, UInt8
 
 from calibration.camera import Camera
 from calibration.posed_camera import PosedCamera
-from reconstruct.export.first_view import FirstView
-from reconstruct.export.stage_scene import StageScene, detail_pictures, stage_scene
+from reconstruct.export.stage_scene import FirstView, StageScene, detail_pictures, stage_scene
 from reconstruct.render.studio import Studio, studio_of
 from reconstruct.stored_run.maps import read_thumbnails
 from reconstruct.stored_run.stage_pack import stage_archive
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.report.drawing import jpeg
+from viewer.report.document import jpeg
 from viewer.stage.facts import BACKGROUND, first_window, home_pose, lit_photos, stage_facts
 
 QUALITY, NORMAL_QUALITY, PHOTO_QUALITY = 90, 95, 82  # JPEG

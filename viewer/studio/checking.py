@@ -15,7 +15,7 @@ from typing import Any
 from capture.errors import UserError
 from capture.files.atomic import write_json
 from capture.session.session import FEWEST_LIT
-from capture.session.skipped import clips_of, photos_of
+from capture.session.sorting import clips_of, photos_of
 from reconstruct.run.batch import start_command, why_it_failed
 from reconstruct.stored_run.documents import CHECK, read_check
 from viewer.studio.folder import mark_of, without_folder

@@ -147,10 +147,6 @@ class StudioFolder:
         number = next(k for k in range(1, len(names) + 2) if (name if k == 1 else f"{name}-{k}") not in names)
         return self.root / RUNS / (name if number == 1 else f"{name}-{number}")
 
-    def free_bytes(self) -> int:
-        """Return the free bytes of the disk."""
-        return shutil.disk_usage(self.root).free
-
     # --- folders that a person adds ----------------------------------------------------------------------------------
 
     def browse(self, key: str) -> list[tuple[str, bool]]:

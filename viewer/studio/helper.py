@@ -3,11 +3,14 @@
 A task is a function of viewer/studio/tasks.py by its name; one with an argument `on_progress` says in lines how far it
 is before it answers. A helper that dies fails the task at hand and is started again for the next one; one that waits
 for long is ended, which gives its memory back.
+
+The 3D pages of runs (`shadowgraph view`), too, are each a process of its own, which ends with the studio.
 """
 
 import inspect
 import json
 import math
+import re
 import subprocess
 import sys
 import threading
@@ -20,7 +23,10 @@ from typing import Any
 
 from capture.errors import CaptureError, Remedy, UserError
 from capture.files.atomic import parse_json
-from reconstruct.run.batch import start_command
+from capture.files.regular import read_regular
+from reconstruct.run.batch import PROGRAM as COMMAND
+from reconstruct.run.batch import start_command, why_it_failed
+from viewer.studio.folder import StudioFolder
 
 PROGRAM = (sys.executable, "-m", "viewer.studio.tasks")
 IDLE_S = 120.0  # after which a helper is ended
@@ -38,6 +44,10 @@ BUTTONS = {  # of the page, for the remedies of an error; "": the page has no wa
     Remedy.OTHER_FOLDER: "start another run",
     Remedy.PACK_FAULT: "",
 }
+MOST_PAGES = 3  # at a time: each takes some hundred megabytes
+PAGE_LOG = "view.txt"
+PATIENCE_S = 60.0  # until a page answers
+ADDRESS = re.compile(r"Open (http://localhost:\d+\S*)")  # as `view` prints it
 
 
 class Task(Future[Any]):
@@ -207,3 +217,50 @@ def answer_lines(tasks: dict[str, Callable[..., Any]]) -> None:
             answer = {"error": in_page_words(error) or type(error).__name__}
         sys.stderr.write(f"{request['task']} {time.monotonic() - started:.2f} s {answer.get('error', '')}\n")
         say(answer)
+
+
+class LivePages:
+    """Opens pages, and ends the oldest where there are too many."""
+
+    def __init__(self, folder: StudioFolder):
+        """Open nothing yet."""
+        self._folder, self._lock = folder, threading.Lock()
+        self._open: dict[Path, tuple[subprocess.Popen[bytes], str]] = {}
+
+    def open(self, key: str) -> str:
+        """Return the address of the page of a run, once it answers.
+
+        Raises:
+            CaptureError: there is no such run, or its page does not open.
+        """
+        run = self._folder.run(key)
+        with self._lock:
+            known = self._open.pop(run, None)
+            while len(self._open) >= MOST_PAGES:
+                _end(self._open.pop(next(iter(self._open)))[0])
+            if known is None or known[0].poll() is not None:
+                known = self._started(run)
+            self._open[run] = known
+            return known[1]
+
+    def _started(self, run: Path) -> tuple[subprocess.Popen[bytes], str]:
+        log = self._folder.kept / PAGE_LOG
+        process, end = start_command([*COMMAND, "view", str(run), "--no-open"], log), time.monotonic() + PATIENCE_S
+        while time.monotonic() < end and process.poll() is None:
+            if said := ADDRESS.search(read_regular(log).decode(errors="replace")):
+                return process, said.group(1)
+            time.sleep(0.1)
+        code = process.poll()
+        _end(process)
+        raise CaptureError(f"The 3D page did not open: {why_it_failed(code, log)}")
+
+    def close(self) -> None:
+        """End all pages."""
+        for process, _ in self._open.values():
+            _end(process)
+        self._open.clear()
+
+
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    process.terminate()
+    process.wait()

@@ -1,26 +1,32 @@
-"""Library: the cards of the studio's first page, and all that is known of one capture or run."""
+"""Library: the cards of the studio's first page, and all that is known of one capture or run.
+
+The example: photos of a figure that come with the program, and their result, for who has no photos yet.
+"""
 
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import lru_cache
+from functools import cache, lru_cache
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from capture.errors import UserError
+from capture.errors import CaptureError, UserError
 from capture.files.regular import is_regular
 from capture.files.title import title_of
 from capture.intake.parts import Parts
 from capture.session.session import load_settings
-from capture.session.skipped import clips_of, folder_role, photos_of
+from capture.session.sorting import clips_of, folder_role, photos_of
 from reconstruct.run.queue import FAILED, FINISHED, RUNNING, STOPPED, WAITING, Job, Queue
 from reconstruct.run_folder.folder import LOG
 from reconstruct.stored_run.documents import CHECK, REPORT, read_check, read_manifest, read_report
 from reconstruct.stored_run.maps import THUMBS
+from reconstruct.stored_run.stage_pack import FORMAT, opened_pack
 from viewer.display.run_follower import PREVIEW, RunFollower, Status, size_text, status
+from viewer.stage.page import page_html
 from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder, mark_of, without_folder
 
@@ -35,6 +41,9 @@ ROLES = {
     "dark": "without light",
     "side": "from the side",
 }
+EXAMPLE = "Spot, an example"
+EXAMPLE_RESULT = Path(__file__).with_name(f"example-{FORMAT}.zip")  # a stage; .ci/example_result.py makes it
+EXAMPLE_PLACE = ("examples", "spot", "session.toml")  # in a checkout, and in share/shadowgraph of an installation
 
 
 class Library:
@@ -245,3 +254,29 @@ def counts_of(photos: Sequence[Mapping[str, Any]], check: Mapping[str, Any]) -> 
 
 def _photos(count: int) -> str:
     return "photo" if count == 1 else "photos"
+
+
+@cache
+def example_photos() -> Path:
+    """Return the folder of the example's photos.
+
+    Raises:
+        CaptureError: it did not come with this installation.
+    """
+    checkout = Path(__file__).parents[2].joinpath(*EXAMPLE_PLACE)
+    try:
+        files = distribution("shadowgraph").files or ()
+        installed = [Path(str(file.locate())) for file in files if file.parts[-len(EXAMPLE_PLACE) :] == EXAMPLE_PLACE]
+    except PackageNotFoundError:
+        installed = []
+    for settings in (checkout, *installed):
+        if settings.is_file():
+            return settings.resolve().parent
+    raise CaptureError("The example's photos did not come with this installation: install it with pip once more.")
+
+
+@cache
+def example_page() -> bytes | None:
+    """Return the page of the example's result; None where it is of another version of the stage."""
+    pack = opened_pack(EXAMPLE_RESULT)
+    return None if pack is None else page_html("Spot", pack).encode()

@@ -19,18 +19,16 @@ from capture.files.regular import is_regular
 from capture.files.title import keep_title, title_of
 from capture.intake.arrivals import KEEP_FREE, refuse_full_disk
 from capture.intake.parts import Parts
-from capture.session.skipped import clips_of, photos_of
+from capture.session.sorting import clips_of, photos_of
 from capture.session.write_settings import set_entry, set_role
 from reconstruct.run.batch import PROGRAM, Task
 from reconstruct.run.queue import RUNNING, Job, Queue
 from reconstruct.stored_run.stage_pack import StagePack
 from viewer.stage.page import kept_pack
 from viewer.studio.checking import Checks
-from viewer.studio.example import TITLE, example_photos
 from viewer.studio.folder import StudioFolder, Trash, mark_of
-from viewer.studio.helper import Helper, Newest
-from viewer.studio.library import Library, growing_mark
-from viewer.studio.live_pages import LivePages
+from viewer.studio.helper import Helper, LivePages, Newest
+from viewer.studio.library import EXAMPLE, Library, example_photos, growing_mark
 from viewer.studio.saving import Saving
 
 TICK_S = 0.5
@@ -98,7 +96,7 @@ class Studio:
             deleted = [asdict(one) for one in self.trash.list()]
             return {
                 "folder": str(self.folder.root),
-                "free": self.folder.free_bytes(),
+                "free": shutil.disk_usage(self.folder.root).free,
                 "keep_free": KEEP_FREE,
                 "cards": cards,
                 "queue": [self._queued(job, rows.get(self.folder.key(job.run))) for job in jobs],
@@ -188,7 +186,7 @@ class Studio:
         """Make a capture of the example's photos, put a first look at it into the queue, and return the run's key."""
         photos = example_photos()
         with self._lock:
-            capture = self.folder.new_capture(TITLE)
+            capture = self.folder.new_capture(EXAMPLE)
             shutil.copytree(photos, capture, dirs_exist_ok=True)
             return self.start_run(self.folder.key(capture), PRESETS[0])
 

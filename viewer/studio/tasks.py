@@ -83,7 +83,7 @@ def _surface_picture(run: Path, surface: Triangles) -> Image.Image:
     import trimesh
 
     from calibration.calibration import load_calibration
-    from viewer.report.drawing import mesh_picture
+    from viewer.report.document import mesh_picture
     from viewer.report.pictures import view_from_camera
 
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=surface.colours, process=False)

@@ -20,7 +20,7 @@ from capture.files.regular import is_regular, read_regular
 from reconstruct.stored_run.stage_document import save_stage_document
 from viewer.stage.files import HEADERS, HTML
 from viewer.stage.page import page_of, page_policy
-from viewer.studio.example import example_page
+from viewer.studio.library import example_page
 from viewer.studio.studio import Studio
 from viewer.studio_server.gate import FRAMED_POLICY, file_routes, read_body, read_object, sentences, text_of
 from viewer.studio_server.phones import Phones
