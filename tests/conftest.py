@@ -276,6 +276,16 @@ def one_thread():
     torch.set_num_threads(before)
 
 
+@pytest.fixture(scope="module")
+def few_starts():
+    """From here on in its module, fits to the ground's shading begin under one beam, not two: in half the time."""
+    from calibration.flashlight import fit
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit, "START_BEAMS", fit.START_BEAMS[:1])
+        yield
+
+
 @pytest.fixture
 def hull_start(monkeypatch):
     """Solves of shadow pictures start from the hull; to try a height field first takes longer than the rest of them."""

@@ -8,7 +8,6 @@ import struct
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -20,8 +19,8 @@ from fuzz_images import DAMAGES
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
-from strange_runs import DOCUMENTS, MARKUP, STRANGE, by_change
-from test_untrusted_files import Payload, png, tiff
+from strange_runs import DOCUMENTS, MARKUP, STRANGE
+from test_untrusted_files import Payload
 
 from calibration.calibrated_views import CalibratedView, CalibratedViews, save_views
 from calibration.calibration import Calibration, load_calibration, save_calibration
@@ -300,48 +299,6 @@ def by_map(draw: random.Random, run: Path) -> str:
     return f"{path.name}: {way}"
 
 
-def by_kind(draw: random.Random, run: Path) -> str:
-    """Something else than a file: a pipe, a link, a folder, a device, a file of 8 GB that takes no room."""
-    path = _chosen(draw, run, FILES)
-    path.unlink(missing_ok=True)
-    way = draw.choice(["pipe", "secret", "zero", "loop", "nowhere", "folder", "sparse"])
-    targets = {"secret": run.parent / "secret", "zero": Path("/dev/zero"), "loop": path, "nowhere": run / "nowhere"}
-    if way in targets:
-        path.symlink_to(targets[way])
-    elif way == "pipe":
-        os.mkfifo(path)
-    elif way == "folder":
-        path.mkdir()
-    else:
-        with path.open("wb") as file:
-            file.truncate(SPARSE)
-    return f"{path.name}: {way}"
-
-
-@cache
-def _large_png(edge: int, size: int) -> bytes:
-    return png(edge, edge, bytes(size))
-
-
-def by_picture(draw: random.Random, run: Path) -> str:
-    """A picture of another format, of 30,000 x 30,000 pixels, or a folder of them that leads elsewhere."""
-    path = _chosen(draw, run, PICTURES)
-    way = draw.choice(["bomb", "tiff", "svg", "other size", "link"])
-    if way == "bomb":
-        edge = draw.choice([30_000, 8_000])
-        path.write_bytes(_large_png(edge, edge * (3 * edge + 1) if edge == 8_000 else 0))
-    elif way == "tiff":
-        path.write_bytes(tiff(64, 48))
-    elif way == "svg":
-        path.write_text('<svg xmlns="http://www.w3.org/2000/svg"><image href="file:///etc/passwd"/></svg>')
-    elif way == "other size":
-        path.write_bytes(png(7, 5, bytes(5 * 22)))
-    else:
-        (run / "thumbs").rename(run.parent / "elsewhere")
-        (run / "thumbs").symlink_to(run.parent / "elsewhere")
-    return f"{path.name}: {way}"
-
-
 def by_log(draw: random.Random, run: Path) -> str:
     """Lines of other kinds, many lines, a run that seems to go on."""
     way = draw.choice(["values", "many", "lock", "deep"])
@@ -360,32 +317,18 @@ def by_log(draw: random.Random, run: Path) -> str:
 
 WAYS: tuple[Callable[[random.Random, Path], str], ...] = (
     *(by_bytes, by_bytes, by_value, by_value, by_value, by_numbers, by_numbers, by_shape, by_header),
-    *(by_header, by_mesh, by_map, by_kind, by_kind, by_picture, by_log),
+    *(by_header, by_mesh, by_map, by_log),
     *STRANGE,
 )
 
 
 def damaged(draw: random.Random, run: Path) -> str:
     """Damage a run in one way, sometimes in two, and say how."""
-    way = draw.choice(WAYS)
-    said = way(draw, run)
-    if way is by_change:
-        return said
-    if draw.random() < 0.25 and all(_is_small_file(path) for path in _all_files(run)):
-        with suppress(
-            OSError, ValueError, LookupError, SafetensorError, BadZipFile
-        ):  # what is damaged cannot always be again
+    said = draw.choice(WAYS)(draw, run)
+    if draw.random() < 0.25:
+        with suppress(OSError, ValueError, LookupError, SafetensorError, BadZipFile):  # damaged already
             said += "; " + draw.choice(WAYS)(draw, run)
     return said
-
-
-def _is_small_file(path: Path) -> bool:
-    return path.is_file() and not path.is_symlink() and path.stat().st_size < SPARSE
-
-
-def _all_files(run: Path) -> list[Path]:
-    """What stands under the names of files: one that is a pipe would not answer the second damage."""
-    return [path for name in FILES for path in run.glob(name)]
 
 
 def _stored(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:

@@ -64,10 +64,7 @@ class Recipe:
     tone: float = 1.0  # exponent of an unknown tone curve
     contrast: float = 0.0  # of an S-shaped curve on the encoded values: this share of 3 v^2 - 2 v^3
     power_jitter: float = 0.0  # relative, per photo
-    bounce: float = 0.0  # light from the lit side of the object onto the ground, of the flashlight's at the object
-    ambient: float = AMBIENT
     width: int = 320  # px, of 4:3 photos
-    board: bool = False  # a printed board lies beside the object
     near: float = 1.0  # the camera's distance, the object's size and the texture's, of the usual ones
     lights: tuple[Light, ...] = field(default=())
 
@@ -105,10 +102,6 @@ def photograph(recipe: Recipe, seed: int = 0) -> Truth:
     x, y = points[..., 0] / recipe.near, points[..., 1] / recipe.near
     albedo = 0.5 + 0.1 * np.sin(x / 23) * np.cos(y / 31) + 0.05 * np.sin((x + y) / 90)
     albedo = albedo[..., None] * [1.0, 0.9, 0.75]
-    if recipe.board:
-        on_board = (x > 100) & (x < 260) & (y > -60) & (y < 60)
-        print_ = np.where((np.floor(x / 20) + np.floor(y / 20)) % 2 == 0, 0.04, 0.85)[..., None]
-        albedo = np.where(on_board[..., None], print_, albedo)
     lights = tuple(replace(k, power=k.power * (1 + recipe.power_jitter * rng.normal())) for k in lights)
     rolls = rng.uniform(0, np.pi, len(lights))
     photos = [_photo(light, points, albedo, recipe, eye, roll) for light, roll in zip(lights, rolls, strict=True)]
@@ -144,7 +137,7 @@ def _photo(
     if recipe.asymmetry:
         flash = flash * _lopsided(light, points, recipe.asymmetry, roll)[..., None]
     if light.position is None:
-        return albedo * (flash + recipe.ambient)
+        return albedo * (flash + AMBIENT)
     away = -(light.position - AIM)[:2] / np.linalg.norm((light.position - AIM)[:2])
     if recipe.gloss:
         toward, view = (v - points for v in (light.position, eye))
@@ -160,9 +153,5 @@ def _photo(
         flash = np.where(shadow[..., None], 0.02 * flash, flash)
         is_object = np.linalg.norm(offset, axis=-1) < 50
         facing = 0.5 + 0.5 * np.clip(offset @ -away / 50, -1, 1)
-        if recipe.bounce:  # as from a lit patch of 50 mm, on the side that faces the light
-            reach = np.maximum(np.linalg.norm(points - (AIM - np.append(away, 0) * 25), axis=-1), 50.0)
-            side = np.clip(0.5 - 0.5 * (offset @ away) / reach, 0, 1)
-            flash = flash + (recipe.bounce * 0.3 * side * (50 / reach) ** 2)[..., None] * flash.mean(axis=(0, 1))
         flash = np.where(is_object[..., None], flash * (0.3 + facing[..., None]), flash)
-    return albedo * (flash + recipe.ambient)
+    return albedo * (flash + AMBIENT)

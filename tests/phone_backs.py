@@ -10,7 +10,6 @@ from PIL import Image
 
 from calibration.board.board import Board
 from calibration.camera import Camera
-from calibration.pose import Pose
 
 DOTS = 8  # of the drawing of the phone, per mm
 THICKNESS = 9.5  # mm, with a part of the camera's bump
@@ -53,16 +52,13 @@ def draw_back(phone: BackOfPhone) -> tuple[np.ndarray, np.ndarray]:
     return art, body.astype(np.float64)
 
 
-def back_photo(
-    phone: BackOfPhone, board: Board = BOARD, world_from_camera: Pose = FROM_ABOVE, turn: float = 0.0
-) -> np.ndarray:
-    """8-bit photo: the phone lies to the right of the board, `turn` radians anticlockwise from top to top."""
-    table = board_photo(board, CAMERA, world_from_camera).astype(np.float64)
+def back_photo(phone: BackOfPhone) -> np.ndarray:
+    """8-bit photo: the phone lies to the right of the board, top beside top."""
+    table = board_photo(BOARD, CAMERA, FROM_ABOVE).astype(np.float64)
     art, body = draw_back(phone)
-    matrix = world_from_camera.inverse().matrix()
+    matrix = FROM_ABOVE.inverse().matrix()
     plane = np.stack([matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] * THICKNESS + matrix[:3, 3]], 1)
-    c, s = np.cos(turn), np.sin(turn)
-    board_from_phone = np.array([[c, -s, 190.0], [s, c, -80.0], [0, 0, 1]])
+    board_from_phone = np.array([[1, 0, 190.0], [0, 1, -80.0], [0, 0, 1]])
     phone_from_dots = np.array([[1 / DOTS, 0, 0.5 / DOTS - 40], [0, -1 / DOTS, 80 - 0.5 / DOTS], [0, 0, 1]])
     photo_from_dots = CAMERA.matrix() @ plane @ board_from_phone @ phone_from_dots
     size = (CAMERA.width, CAMERA.height)

@@ -1,12 +1,9 @@
-"""What a stranger may put into a run folder that no damage by chance makes: each way changes a run, and says how."""
+"""What a stranger may write into a run's files that no damage by chance makes: each way changes one, and says how."""
 
 import io
 import json
-import os
 import random
-import shutil
 import struct
-import time
 import unicodedata
 import warnings
 import zipfile
@@ -14,7 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-DEEP, LONG = 100_000, 100_000  # brackets within each other; digits of a number, files of a folder by a tenth
+DEEP, LONG = 100_000, 100_000  # brackets within each other; digits of a number
 DOCUMENTS = ("calibration.json", "report.json", "manifest.json", "check.json", "config.json")
 DOCUMENTS += ("memory.json", "stage.json")
 MARKUP = "<script>alert('shadowgraph')</script><img src=x onerror=alert(1)>&\"'"  # which must stay text
@@ -22,7 +19,6 @@ NAMES = ("../photos/IMG_1.jpg", "..\\IMG_1.jpg", "C:\\IMG_1.jpg", "/IMG_1.jpg", 
 NAMES += ("IMG_1.jpg\0.png", "\u202egpj.1_GMI", "IMG_1.jpg\u200b", "\ud800.jpg", unicodedata.normalize("NFD", "Bü.jpg"))
 NAMES += ("img_1.JPG", "IMG_1.jpg\r\nSet-Cookie: a", "\x1b]0;title\x07", "%2e%2e%2fsecret", "~/.ssh/id", "*")
 NAMES += ("file:///etc/passwd", "x" * 5000, MARKUP)
-CHANGING_S = 1.5  # for how long a file goes on changing
 
 
 def by_text(draw: random.Random, run: Path) -> str:
@@ -129,57 +125,4 @@ def by_archive(draw: random.Random, run: Path) -> str:
     return f"stage.zip: {way}"
 
 
-def by_company(draw: random.Random, run: Path) -> str:
-    """Things beside the files of a run: thousands of them, folders that lead elsewhere or into themselves, pipes."""
-    links = {"exports": run.parent / "elsewhere", "heap": run, "photos": run, "view_2": Path("/proc/self")}
-    links |= {"view_3": Path("/"), "kept_photos": Path("/dev"), "wishes": Path("/dev/zero")}
-    way = draw.choice(["thousands", "pipes", "case", "closed", "glb", *links])
-    if way == "thousands":
-        for i in range(LONG // 20):
-            (run / f"thumbs/{i}.jpg").write_bytes(b"")
-    elif way == "pipes":
-        (run / "wishes").mkdir(exist_ok=True)
-        for wish in ("stop", "pause", "draft"):
-            os.mkfifo(run / "wishes" / wish)
-    elif way == "case":
-        for name in ("REPORT.JSON", "Mesh.PLY", "Fields.safetensors", unicodedata.normalize("NFD", "é.json")):
-            (run / name).write_bytes(b"{}")
-    elif way == "closed":
-        (run / draw.choice(["report.json", "thumbs", "mesh.ply"])).chmod(0)
-    elif way == "glb":
-        header = struct.pack("<4sIIII", b"glTF", 2, 2**32 - 1, 2**32 - 1, 0x4E4F534A)
-        (run / "mesh.glb").write_bytes(header + b'{"buffers":[{"uri":"../secret","byteLength":1e18}]}')
-    else:
-        shutil.rmtree(run / way, ignore_errors=True)  # a run of several views has such folders
-        (run / way).symlink_to(links[way])
-    return f"beside: {way}"
-
-
-def by_change(draw: random.Random, run: Path) -> str:
-    """A file that somebody else cuts, grows and exchanges while it is read."""
-    names = ("fields.safetensors", "mesh.ply", "log.jsonl", "report.json", "calibration.json", "depth.npy", "stage.zip")
-    path = run / draw.choice(names)
-    whole = path.read_bytes()
-    pid = os.fork()
-    if not pid:
-        os.setpgid(0, 0)
-        end = time.monotonic() + CHANGING_S
-        try:
-            while time.monotonic() < end and run.exists():
-                with path.open("r+b") as file:
-                    file.truncate(draw.randrange(len(whole)))
-                time.sleep(0.002)
-                fresh = path.with_name("fresh")
-                fresh.write_bytes(whole[: draw.randrange(len(whole))] + bytes(draw.randrange(100)))
-                fresh.replace(path)
-                time.sleep(0.002)
-                path.write_bytes(whole)
-                time.sleep(0.004)
-        finally:
-            os._exit(0)
-    return f"{path.name}: changing"
-
-
-STRANGE: tuple[Callable[[random.Random, Path], str], ...] = (
-    *(by_text, by_text, by_names, by_archive, by_company, by_change),
-)
+STRANGE: tuple[Callable[[random.Random, Path], str], ...] = (by_text, by_text, by_names, by_archive)

@@ -13,15 +13,15 @@ from capture.session import seen
 from reconstruct.check.coach import Coach, FirstLook, SeenLight, missing_sides, next_words, seen_lines
 
 SPOT = Path(__file__).parent.parent / "examples" / "spot"
-LIT = [f"IMG_{number}.jpg" for number in (101, 105, 109, 113, 117, 121, 125)]
+LIT = [f"IMG_0{number}.jpg" for number in (101, 105, 109, 113, 117, 121, 125)]
 
 
-def flat_capture(folder: Path, lit: list[str]) -> Path:
+def flat_capture(folder: Path, lit: list[str], capture: Path = SPOT) -> Path:
     """As phones give it: one flat folder, nothing said about roles."""
     folder.mkdir()
-    shutil.copy(SPOT / "board" / "IMG_0001.jpg", folder)
+    shutil.copy(capture / "board" / "IMG_0001.jpg", folder)
     for name in lit:
-        shutil.copy(SPOT / "photos" / name.replace("IMG_", "IMG_0"), folder)
+        shutil.copy(capture / "photos" / name, folder)
     return folder
 
 
@@ -62,15 +62,15 @@ def test_what_is_wrong_with_a_photo_is_named_at_once_and_only_new_photos_are_rea
     assert {path.name for path in decoded} == {f"IMG_020{k}.jpg" for k in (1, 2, 3, 4)}
 
 
-@pytest.mark.slow  # a fit of all photos as the truth
-def test_lights_of_single_photos_are_where_the_whole_calibration_puts_them(tmp_path):
-    assert shadowgraph.main(["calibrate", str(SPOT), "--out", str(tmp_path / "run")]) == 0
-    calibration = load_calibration(tmp_path / "run" / "calibration.json")
-    folder = flat_capture(tmp_path / "spot", LIT[:5])
+@pytest.mark.slow  # the truth is the calibration of a whole run
+def test_lights_of_single_photos_are_where_the_whole_calibration_puts_them(phone_run, tmp_path):
+    capture, calibration = phone_run[0], load_calibration(phone_run[1] / "calibration.json")
+    lit = sorted(path.name for path in (capture / "photos").iterdir())[::2]
+    folder = flat_capture(tmp_path / "spot", lit[:5], capture)
     coach = Coach(folder)
     coach.look()
-    for name in LIT[5:]:
-        shutil.copy(SPOT / "photos" / name.replace("IMG_", "IMG_0"), folder)
+    for name in lit[5:]:
+        shutil.copy(capture / "photos" / name, folder)
     seen = {light.photo: light for light in coach.look().lights}
     centre = calibration.posed_camera.looked_at()
     for light in calibration.lights:
@@ -78,7 +78,7 @@ def test_lights_of_single_photos_are_where_the_whole_calibration_puts_them(tmp_p
             way = np.asarray(light.position) - centre
             height = np.degrees(np.arcsin(way[2] / np.linalg.norm(way)))
             assert abs(seen[light.photo].elevation - height) < 4
-    assert len(seen) == len(LIT)
+    assert len(seen) == len(lit)
 
 
 def ring(*azimuths: float, elevation: float = 40.0) -> tuple[SeenLight, ...]:
@@ -109,8 +109,6 @@ def test_an_empty_folder_and_one_without_a_board_are_told_what_comes_first(tmp_p
 
 
 def test_watch_says_what_is_there_and_what_comes_next(tmp_path, capsys):
-    import shadowgraph
-
     shutil.copy(SPOT / "board" / "IMG_0001.jpg", tmp_path)
     (tmp_path / "broken.jpg").write_bytes(b"no photo")
     assert shadowgraph.main(["watch", str(tmp_path), "--once"]) == 0

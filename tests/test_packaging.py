@@ -72,11 +72,6 @@ def test_each_command_of_the_readme_works_alone_in_a_fresh_clone():
     )
 
 
-def test_the_readme_is_short_and_says_windows_paths_once():
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert len(readme.split()) <= 700 and readme.count("Scripts") == 1
-
-
 @pytest.mark.parametrize(
     ("name", "views", "object_poses"), [("spot", [""], []), ("cow", ["view_1", "view_2", "view_3"], ["turned_1"])]
 )

@@ -16,8 +16,8 @@ THREE = BackOfPhone(lenses=((-22.0, 60.0, 6.5), (-22.0, 44.0, 6.5), (-8.0, 40.0,
 OFFSETS = np.array([[10.0, -8.0], [10.0, 8.0], [-4.0, 12.0]])  # from each lens to the LED, x and y of the back
 
 
-def read(tmp_path: Path, phone: BackOfPhone, given: PhoneBack | None = None, **seen) -> BackView:
-    path = save_back(tmp_path / "phone_back.png", back_photo(phone, **seen))
+def read(tmp_path: Path, phone: BackOfPhone, given: PhoneBack | None = None) -> BackView:
+    path = save_back(tmp_path / "phone_back.png", back_photo(phone))
     return read_phone_back(path, BOARD, given or PhoneBack())
 
 

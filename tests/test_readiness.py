@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from synthetic import HEAP, Look, Sphere, Truth, render
 
 import reconstruct.source.source as calibration_source
@@ -22,12 +21,8 @@ from reconstruct.check.verdict import CaptureCheck
 from reconstruct.source.photos import Photos
 from reconstruct.source.source import RunOptions, Source
 from viewer.report.check_page import (
-    CHOSEN,
-    LED,
     PAGE,
-    back_picture,
     check_lines,
-    check_page,
     shadow_picture,
     write_check,
 )
@@ -176,20 +171,6 @@ def test_the_page_and_the_terminal_say_it_all(truth, cover, tmp_path):
     lines = check_lines(checked)
     assert lines[0] == checked.readiness.sentence() and any(line.startswith("Shoot next: ") for line in lines)
     assert shadow_picture(cover).shape == (*cover.mask.shape, 3)
-
-
-def test_the_page_shows_what_was_taken_for_the_led_and_for_the_lens(truth, cover, tmp_path):
-    grey = np.full((120, 160, 3), 90, np.uint8)
-    read = {"led_px": [80.0, 60.0], "lenses_px": [[60.0, 50.0], [95.0, 70.0]], "lens_px": [95.0, 70.0], "why": "found"}
-    marked = back_picture(grey, read)
-    yellow, green = ((np.abs(marked.astype(int) - colour).sum(-1) < 60).any() for colour in (LED, CHOSEN))
-    assert yellow and green
-    assert not (np.abs(back_picture(grey, read | {"lens_px": None}).astype(int) - CHOSEN).sum(-1) < 60).any()
-    path = tmp_path / "phone_back.png"
-    Image.fromarray(grey).save(path)
-    calibration = replace(truth.calibration, residuals={"phone_back": read})
-    checked = CaptureCheck("heap", judge(calibration, (), cover), calibration, (), cover, (), path)
-    assert "The flashlight&#x27;s phone" in check_page(checked).replace("'", "&#x27;")
 
 
 @pytest.mark.parametrize("n_used", [26, 2])

@@ -69,23 +69,6 @@ def test_a_run_that_failed_says_why_without_the_servers_path(tmp_path):
 
 
 @pytest.mark.browser
-def test_photos_that_will_not_be_used_are_named_and_counted(browser, tmp_path):
-    capture = capture_in(tmp_path, "vase")
-    for number in range(10, 16):
-        (capture / "photos" / f"IMG_{number}.jpg").write_bytes(jpeg(number)[:-200])
-    with served(tmp_path) as (_, _, owner):
-        tab, _ = opened(browser, owner, PHONE)
-        tab.goto(f"http://127.0.0.1:{owner.port}/#/capture/vase")
-        tab.wait_for_selector("button:has-text('Leave 6 out and go on')")
-        said = {6: tab.inner_text("p:has-text('Will not be used')")}
-        for count in (1, 4):
-            bad = [{"name": f"photos/IMG_{number}.jpg", "remarks": [["unreadable", ""]]} for number in range(count)]
-            said[count] = tab.evaluate("async (bad) => (await import('/upload.js')).unused(bad)", bad)
-    for count, words in said.items():
-        assert words.count("(unreadable)") == min(count, 4) and ("and 2 more." in words) == (count == 6)
-
-
-@pytest.mark.browser
 def test_each_refused_file_is_named_once_and_dismissed_without_an_offer_to_try_again(browser, tmp_path):
     photos = tmp_path / "drop"
     photos.mkdir()
@@ -111,24 +94,3 @@ def test_each_refused_file_is_named_once_and_dismissed_without_an_offer_to_try_a
         tab.reload()
         tab.wait_for_selector("text=IMG_2.jpg")
         assert "Not taken" not in tab.inner_text("main")
-
-
-@pytest.mark.browser
-def test_a_used_code_says_to_scan_the_new_one_and_so_does_a_page_that_was_loaded_anew(browser, tmp_path):
-    capture_in(tmp_path, "vase")
-    with served(tmp_path) as (_, phones, owner):
-        owner.ok("let_in", key="vase")
-        address = phones.row()["address"]
-        first, second = (browser.new_context(viewport=PHONE).new_page() for _ in range(2))
-        first.goto(address)
-        first.wait_for_selector("text=Choose photos")
-        second.goto(address)
-        for _ in range(2):
-            second.wait_for_selector("text=Scan the new code")
-            second.wait_for_timeout(1800)  # the page asks again meanwhile
-            assert "Scan the new code" in second.inner_text("main") and "token" not in second.inner_text("main")
-            second.reload()
-        first.goto("about:blank")
-        first.goto(address)  # a phone that is in scans its old code again
-        first.wait_for_selector("text=Choose photos")
-        owner.ok("send_away")

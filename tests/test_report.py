@@ -6,15 +6,18 @@ from html.parser import HTMLParser
 import fake_run
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from calibration.calibration import save_calibration
+from capture.photos.photo import encode_srgb
 from reconstruct.check.light_coverage import widest_gap
 from reconstruct.run_folder.folder import RunFolder
+from reconstruct.sdf.grid import SdfGrid
 from viewer.report.document import difference_picture, mesh_picture, normal_picture, reduced
 from viewer.report.figures import curves, lights_from_above
 from viewer.report.numbers import refinement_part
-from viewer.report.pictures import guess_facts, mesh_pictures
+from viewer.report.pictures import computed_picture, guess_facts, is_shadow_picture, mesh_pictures
 from viewer.report.report import write_report
 
 
@@ -167,6 +170,24 @@ def test_a_brighter_photo_is_red_a_darker_one_blue_and_an_equal_one_grey():
 def test_pictures_are_made_smaller_and_never_larger():
     assert reduced(np.zeros((300, 400, 3), np.uint8), 100).shape == (75, 100, 3)
     assert reduced(np.zeros((30, 40, 3), np.uint8), 100).shape == (30, 40, 3)
+
+
+def gap(one: np.ndarray, other: np.ndarray) -> float:
+    """What 95 % of the pixels differ by less than, of white."""
+    return float(np.percentile(np.abs(one.astype(float).mean(-1) - other.mean(-1)) / 255, 95))
+
+
+def test_a_photo_is_explained_by_the_right_surface_and_a_shadow_picture_by_where_light_arrives(truth):
+    calibration, fields = fake_run.calibration_of(truth), fake_run.fields_of(truth)
+    name, photo, grid = calibration.lights[3].photo, encode_srgb(truth.stack.rgb[3]), fields.grid
+    computed = computed_picture(fields, calibration, name, photo)
+    aside = SdfGrid(grid.values, grid.origin + torch.tensor([12.0, 0.0, 0.0]), grid.spacing)
+    wrong = computed_picture(replace(fields, grid=aside), calibration, name, photo)
+    assert gap(photo, computed) < 0.05 < 0.1 < gap(photo, wrong) and not is_shadow_picture(photo)
+    black_and_white = np.repeat(np.where(computed.mean(-1, keepdims=True) > 25, 255, 0), 3, -1).astype(np.uint8)
+    found = computed_picture(fields, calibration, name, black_and_white)
+    assert is_shadow_picture(black_and_white) and is_shadow_picture(found)
+    assert float((found != black_and_white).mean()) < 0.05
 
 
 # --- drawings --------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from calibration.flashlight.model import Evidence, Flashlights, _model, cell_res
 from calibration.flashlight.pictured import as_pictured, bent, with_response
 from calibration.lights.response import TERMS, bend, integrals, slopes
 
+pytestmark = pytest.mark.usefixtures("few_starts")
 CURVE = np.array([0.0, 0.1, 0.1, 0.0, -0.2, -0.2, 0.1, 0.1])  # a dip, as a phone makes that lifts dark regions
 
 

@@ -15,6 +15,7 @@ from flashlight_photos import (
     photograph,
 )
 
+from calibration.flashlight import light_estimate
 from calibration.flashlight.fit import collect, first_guess, fit_flashlights, without_gloss
 from calibration.flashlight.light_estimate import locate_lights
 from calibration.flashlight.model import (
@@ -53,8 +54,12 @@ def test_positions_are_found_to_half_a_per_cent_despite_object_shadows_and_textu
 
 
 @pytest.mark.parametrize(("near", "reach"), [(0.24, (380, 850)), (2.2, (250, 700))])
-def test_lights_are_found_wherever_the_camera_stands(near, reach):
-    """From a coin seen from 150 mm to a chair seen from 1.4 m: a hand holds the light as far away as ever."""
+def test_lights_are_found_wherever_the_camera_stands(near, reach, monkeypatch):
+    """From a coin seen from 150 mm to a chair seen from 1.4 m: a hand holds the light as far away as ever.
+
+    By shading: a small ground's lights are so uncertain that outlines would be asked, too, for half a minute.
+    """
+    monkeypatch.setattr(light_estimate, "with_outlines", lambda *_: None)
     recipe = Recipe(near=near, lights=handheld_lights(8, np.random.default_rng(7), reach))
     truth = photograph(recipe)
     found = locate_lights(truth.stack, recipe.posed_camera(), np.ones(8, bool))
@@ -86,6 +91,7 @@ def test_thejacobian_is_that_of_the_model(truth):
     np.testing.assert_allclose(((there - back) / 2)[inside], linear[inside], atol=1e-8)  # third order of 1e-4 steps
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_a_photo_not_lit_by_the_flashlight_is_refused_and_spoils_no_other(truth):
     rng = np.random.default_rng(5)
     rgb = truth.stack.rgb.copy()
@@ -95,6 +101,7 @@ def test_a_photo_not_lit_by_the_flashlight_is_refused_and_spoils_no_other(truth)
     assert np.delete(truth.errors(found.lights), 3).max() < 0.025
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_one_flashlight_is_not_five_times_as_strong_in_one_photo_as_in_the_others(truth):
     """A fifth weaker it may be: auto exposure that the file does not tell."""
     rgb = truth.stack.rgb.copy()
@@ -124,16 +131,16 @@ def test_beams_that_are_not_round_are_noticed_and_cost_little():
     assert truth.share_inside(found.lights) >= 0.8
 
 
+@pytest.mark.usefixtures("few_starts")
 @pytest.mark.parametrize(
     "curve",
     [
         pytest.param({"tone": 1.25}, id="steeper by a quarter"),
-        pytest.param({"tone": 0.85}, id="flatter by a seventh", marks=pytest.mark.slow),
         pytest.param({"contrast": 0.15}, id="S-shaped", marks=pytest.mark.slow),
     ],
 )
 def test_a_tone_curve_that_is_not_the_assumed_one_is_covered_by_the_stated_sigmas(curve):
-    steep = photograph(Recipe(n_photos=12, **curve))
+    steep = photograph(Recipe(n_photos=10, **curve))
     lights = locate_lights(steep.stack, POSED_CAMERA, every(steep.stack)).lights
     in_sigmas = np.abs(steep.off(lights)) / np.array([light.sigma for light in lights])
     assert (in_sigmas < 2).mean() > 0.9 and (in_sigmas < 3).mean() > 0.985

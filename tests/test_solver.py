@@ -21,15 +21,13 @@ SMALL = FitConfig(levels=(Level(24, 30, (0.5, 0.4), 3, 5e-4), Level(40, 30, (0.4
 
 
 class Listener:
-    """A SolveReporter that remembers, and may stop the solve."""
+    """A SolveReporter that remembers."""
 
-    def __init__(self, stop_at: int | None = None):
-        self.lines, self.stop_at = [], stop_at
+    def __init__(self):
+        self.lines = []
 
     def __call__(self, *, stage, done, total, message, numbers, surface):
         self.lines.append((stage, done, total, numbers))
-        if stage == "solve" and done == self.stop_at:
-            raise KeyboardInterrupt
 
 
 def depth_error(fields, scene, truth) -> float:

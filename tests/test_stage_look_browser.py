@@ -1,14 +1,11 @@
 """How the stage looks and is used, in a real browser, on three made objects: its light, its frame, legend and keys."""
 
-import io
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from chromium import NO_DRAWING, STATE, stage_picture, wait_samples
-from PIL import Image
 from stage_runs import stage_run
 from test_stage_page import HEIGHT, WIDTH, light_of, view_of
 
@@ -141,44 +138,3 @@ def test_the_object_fills_the_part_of_the_window_that_is_free(run, window, size)
         if not isinstance(turn, float) and not (is_open and is_narrow):
             filled = max((right - left) / free_right, (bottom - top) / free_bottom)
             assert filled > 0.8 or (is_narrow and (bottom - top) / free_bottom > 0.6)
-
-
-def test_what_is_known_has_its_legend_with_the_menu_closed_and_text_can_be_read_on_any_background(window):
-    tab = window
-    tab.evaluate("document.getElementById('panel').hidden || document.getElementById('menu').click()")
-    assert not tab.locator("#legend").is_visible() and not tab.locator("#panel").is_visible()
-    tab.keyboard.press("6")
-    assert tab.locator("#legend").is_visible() and not tab.locator("#panel").is_visible()
-    words = tab.locator("#legend li").all_inner_texts()
-    assert words == ["seen in the photos", "held by shadows", "a guess"]
-    signs = [
-        np.asarray(Image.open(io.BytesIO(sign.screenshot())).convert("L")).astype(float)[3:-3, 3:-3]
-        for sign in tab.locator("#legend i").all()
-    ]
-    greys = sorted(sign.mean() for sign in signs)
-    assert min(np.diff(greys)) > 30  # told apart without any colour
-    assert signs[0].std() < 3 and signs[1].std() > 15 and signs[2].std() > 15  # plain, and two patterns
-    rows = tab.evaluate("""() => ["h1", "#size", "#bar-text", "#legend li", "#menu", "#share", "#drag-view"].map(
-      name => {
-      let it = document.querySelector(name), ink = getComputedStyle(it).color;
-      while (/, 0\\)$|transparent/.test(getComputedStyle(it).backgroundColor)) it = it.parentElement;
-      return [ink, getComputedStyle(it).backgroundColor]; })""")
-    for ink, plate in rows:
-        for behind in (0.0, 255.0):
-            assert contrast(numbers(ink), numbers(plate), behind) >= 4.5, (ink, plate, behind)
-    tab.keyboard.press("1")
-    assert not tab.locator("#legend").is_visible()
-
-
-def numbers(css: str) -> list[float]:
-    return [float(x) for x in re.findall(r"[\d.]+", css)]
-
-
-def contrast(ink: list[float], plate: list[float], behind: float) -> float:
-    """Contrast by WCAG 2 of opaque text on a plate that lets something of a grey behind it through."""
-    alpha = plate[3] if len(plate) > 3 else 1.0
-    luminances = [
-        decode_srgb(np.array(rgb).round().astype(np.uint8)) @ [0.2126, 0.7152, 0.0722]
-        for rgb in (ink[:3], [alpha * x + (1 - alpha) * behind for x in plate[:3]])
-    ]
-    return float((max(luminances) + 0.05) / (min(luminances) + 0.05))

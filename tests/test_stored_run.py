@@ -87,7 +87,7 @@ def test_a_damaged_run_is_read_or_refused_in_sentences(whole, tmp_path_factory, 
         read_all(run)
     assert not (run / "RAN").exists() and not watch.written, how
     assert not [path for path in watch.read if "secret" in os.path.realpath(path)], how
-    shutil.rmtree(folder, ignore_errors=True)  # a file that changes while it is read may still be written
+    shutil.rmtree(folder)
 
 
 def test_a_packed_stage_is_whole_or_counts_as_none(run):
@@ -314,9 +314,9 @@ def test_commands_end_in_one_sentence(name, run, capsys):
 
 
 @pytest.mark.slow
-def test_a_hundred_damaged_runs_end_well_in_every_command(tmp_path):
+def test_damaged_runs_end_well_in_every_command(tmp_path):
     seed = str(random.Random(os.environ.get("SHADOWGRAPH_SEED", "slow")).randrange(10**6))
-    words = [sys.executable, str(ROOT / "benchmarks" / "fuzz_runs.py"), "--runs", "100", "--seed", seed]
+    words = [sys.executable, str(ROOT / "benchmarks" / "fuzz_runs.py"), "--runs", "75", "--seed", seed]
     done = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stdout[-3000:]
-    assert re.search(r"\| together \| +100 ", done.stdout)
+    assert re.search(r"\| together \| +75 ", done.stdout)

@@ -30,24 +30,6 @@ def opened(browser, client, size, is_drawn: bool = True):
     return tab, bad
 
 
-@pytest.mark.slow
-def test_back_closes_a_dialog_with_the_page_that_opened_it(browser, tmp_path):
-    capture_in(tmp_path, "vase")
-    with served(tmp_path) as (_, _, owner):
-        tab, bad = opened(browser, owner, PHONE)
-        for words in ("Rename", "Show on a screen"):
-            tab.click(".card a.face")
-            tab.wait_for_selector("text=Are the photos good?")
-            tab.click("summary:has-text('Board')")
-            tab.click(f"button:has-text('{words}')")
-            tab.wait_for_selector("dialog")
-            tab.go_back()
-            tab.wait_for_selector(".card")
-            assert not tab.query_selector("dialog")
-        assert not bad
-    assert not (tmp_path / ".studio" / "notes.json").exists()
-
-
 def test_names_of_strangers_are_text_and_mistakes_are_sentences(browser, tmp_path):
     evil = '<img src=x onerror="document.title=1">'
     capture_in(tmp_path, "vase")
@@ -120,15 +102,3 @@ def test_the_coach_speaks_once_and_shakes_for_a_photo_that_is_bad(browser, tmp_p
         }"""
         )
     assert said == [["IMG_1.jpg: blurred. It will not be used. Next: lower, from the left.", "Done."], 1]
-
-
-@pytest.mark.slow
-def test_a_page_says_that_the_studio_is_gone_and_that_it_is_back(browser, tmp_path):
-    capture_in(tmp_path, "vase")
-    with served(tmp_path) as (_, _, owner):
-        tab, _ = opened(browser, owner, DESKTOP)
-        tab.wait_for_selector(".card")
-        port = owner.port
-    tab.wait_for_selector("text=The studio does not answer")
-    with served(tmp_path, port=port):
-        tab.wait_for_selector("text=The studio is back.")

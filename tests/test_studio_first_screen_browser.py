@@ -128,23 +128,6 @@ def test_keys_reach_the_result_while_a_button_has_the_focus(result):
 
 
 @pytest.mark.browser
-def test_nothing_to_press_stands_before_the_model_and_it_alone_fills_the_window(result):
-    tab, _ = result
-    for width, height in ((360, 640), (1000, 640)):
-        tab.set_viewport_size({"width": width, "height": height})
-        model = tab.locator("iframe.result").bounding_box()
-        assert model["y"] < 0.2 * height and model["height"] > 0.6 * height
-        tops = tab.eval_on_selector_all(
-            "main button, main a.button", "all => all.map(e => e.getBoundingClientRect().top)"
-        )
-        assert min(tops) >= model["y"] + model["height"] and not tab.evaluate(RULES)
-    tab.click("button:has-text('Fill the window')")
-    wait_until(tab, lambda: tab.evaluate("document.fullscreenElement !== null"))
-    assert tab.evaluate("document.fullscreenElement.className") == "result"
-    tab.evaluate("document.exitFullscreen()")
-
-
-@pytest.mark.browser
 def test_every_text_stands_out_also_on_buttons_that_cannot_be_pressed(page):
     tab, _ = page
     for place, ready in PAGES.items():

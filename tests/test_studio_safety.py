@@ -1,7 +1,6 @@
 """Nobody but the owner, and phones that were let in, reaches the studio; nothing leads outside its folder."""
 
 import http.client
-import itertools
 import json
 import os
 import re
@@ -148,9 +147,10 @@ def test_no_value_of_a_request_is_a_fault_of_the_program_at_any_address(let_in, 
         for route in app.routes:
             address = re.sub(r"\{[^}]*\}", words, route.path) + f"?{query}"
             if route.path not in UNTRIED:
-                for method, body in itertools.product(route.methods - {"HEAD"} or {"HEAD"}, bodies):
-                    answer = client.raw(method, address, body.encode() if method in ("POST", "PUT") else b"", **headers)
-                    assert answer.status < 500, (method, route.path, answer.content[:300])
+                for method in route.methods - {"HEAD"} or {"HEAD"}:
+                    for body in bodies if method in ("POST", "PUT") else [""]:
+                        answer = client.raw(method, address, body.encode(), **headers)
+                        assert answer.status < 500, (method, route.path, answer.content[:300])
     assert owner.get("/api/state")[0] == 200
 
 

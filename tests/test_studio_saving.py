@@ -66,8 +66,12 @@ REFUSED = (("stl", "wide", "no number"), ("../x", "", "no kind"))  # format, siz
 FAILED = (("stl", "0", "no size to print"), ("3mf", "nan", "size"))  # and what, when it was tried
 
 
-def test_what_cannot_be_saved_is_a_sentence(folder):
+def test_what_cannot_be_saved_is_a_sentence_and_a_file_is_called_as_its_run_is_now(folder):
     with served(folder) as (_, _, owner):  # one for all: its helper takes 3 s to start
+        owner.ok("rename", key=RUN, title="Übung / 1")
+        assert made(owner, "off")["file"] == "Übung - 1.off"
+        assert quote("Übung - 1.off") in owner.raw("GET", address("off")).headers["Content-Disposition"]
+        owner.ok("rename", key=RUN, title="heap")
         for name, size, said in REFUSED:
             status, answer = owner.post("save", key=RUN, format=name, size=size)
             assert status == 400 and said in answer["error"], (name, size)

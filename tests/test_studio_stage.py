@@ -3,15 +3,10 @@
 import json
 from concurrent.futures import Future
 
-import pytest
-from chromium import wait_until
 from studio_client import Client, served
-from test_studio_browser import opened
 
-from reconstruct.export.export import export
 from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
 from reconstruct.stored_run.stage_pack import STAGE_PACK, StagePack
-from viewer.stage.page import FORMATS
 
 PAGE, DOCUMENT = "/stage/runs/heap/", "/stage/runs/heap/stage.json"
 NOTED = json.dumps(
@@ -62,24 +57,3 @@ def test_a_damaged_pack_or_one_of_another_solve_counts_as_none(studio_folder, tm
         mesh.write_bytes(surface + b" ")
         assert isinstance(studio.stage("runs/heap"), Future)
         mesh.write_bytes(surface)
-
-
-@pytest.mark.browser
-@pytest.mark.slow
-def test_a_note_made_in_the_studio_is_kept_with_the_run_and_goes_with_its_export(browser, studio_folder, tmp_path):
-    run = studio_folder / "runs" / "heap"
-    with served(studio_folder) as (_, _, owner):
-        tab, said = opened(browser, owner, {"width": 1200, "height": 800})
-        tab.goto(f"http://127.0.0.1:{owner.port}/#/run/runs%2Fheap")
-        frame = tab.frame_locator("iframe.result")
-        tab.focus("section.save select")  # before the stage is there
-        frame.locator("summary:has-text('Notes and views')").wait_for(state="attached")
-        wait_until(tab, lambda: frame.locator("#first").count() == 0)  # the page's own picture has taken its place
-        assert tab.evaluate("document.activeElement.tagName") == "SELECT"  # and leaves the keys to whoever has them
-        frame.locator("summary:has-text('Notes and views')").press("Enter")
-        frame.locator("#save-view").press("Enter")
-        wait_until(tab, lambda: (run / "stage.json").exists())
-        assert not said
-    found = read_stage_document(run)
-    assert found is not None and [view["name"] for view in found["views"]] == ["View 1"]
-    assert "html" in FORMATS and '"name":"View 1"' in export(run, "html", tmp_path / "it.html").path.read_text()

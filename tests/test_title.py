@@ -5,7 +5,6 @@ from urllib.parse import quote
 
 import pytest
 from studio_client import served
-from test_studio_saving import RUN, address, made
 
 from capture.errors import CaptureError
 from capture.files.title import TITLE, as_name, hand_title_on, keep_title, title_of
@@ -65,14 +64,6 @@ def test_results_reports_pages_and_files_have_the_title(finished_run, tmp_path):
     escaped = title.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     assert page is not None and f"<title>{escaped}" in page[0].decode()
     assert "<cup>" not in page[0].decode()
-
-
-def test_a_file_to_download_is_called_as_its_run_is_now(finished_run, tmp_path):
-    finished_run(tmp_path / "runs")
-    with served(tmp_path) as (_, _, owner):
-        owner.ok("rename", key=RUN, title="Übung / 1")
-        assert made(owner, "off")["file"] == "Übung - 1.off"
-        assert quote("Übung - 1.off") in owner.raw("GET", address("off")).headers["Content-Disposition"]
 
 
 @pytest.mark.parametrize("content", [b"", b" \n\t ", b"\x00\x07", b"x" * 100_000, b"\xff\xfe"])

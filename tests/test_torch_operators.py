@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from synthetic import BALL, Look, render
-from torch import Tensor
 
 from capture.errors import ReconstructionError
 from reconstruct.config import FitConfig, Level
@@ -18,7 +17,6 @@ from reconstruct.solve.backend import solver_device
 from reconstruct.solve.ray_operators import RayOperators
 from reconstruct.solve.solver import fit
 from reconstruct.torch_sdf import rays as torch_march
-from reconstruct.torch_sdf.march import Volume
 from reconstruct.torch_sdf.ray_field import ray_field
 
 NODES = 40
@@ -155,11 +153,3 @@ def test_the_device_is_chosen_by_name():
     level_set = LevelSet(two_balls(), np.zeros(3), 1.0)
     assert level_set.on(None) is level_set
     assert level_set.on(TORCH).device == TORCH
-
-
-@pytest.mark.skipif(not torch.backends.mps.is_available(), reason="torch sees no MPS device")
-def test_sampling_on_mps_needs_no_float64():
-    phi = torch.from_numpy(two_balls())
-    points = torch.rand(100, 3) * NODES
-    found: Tensor = Volume.of(phi.to("mps")).sample(points.to("mps"))
-    torch.testing.assert_close(found.cpu(), Volume.of(phi).sample(points), atol=1e-4, rtol=1e-4)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from dataset_folders import write_shadowneus
 from synthetic import Look, Sphere, render
+from test_solver import Listener
 
 import shadowgraph
 from capture.errors import ReconstructionError
@@ -43,16 +44,6 @@ MINIATURE = TrainConfig(
     mesh_nodes=48,
 )
 TINY = replace(MINIATURE, start_steps=5, iterations=6, pixels=24, camera_steps=24, mesh_nodes=12)
-
-
-class Listener:
-    """A SolveReporter that remembers."""
-
-    def __init__(self):
-        self.lines = []
-
-    def __call__(self, *, stage, done, total, message, numbers, surface):
-        self.lines.append((stage, done, total, numbers))
 
 
 @pytest.fixture(scope="module")

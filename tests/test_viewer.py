@@ -4,9 +4,7 @@ import fake_run
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
 
-from capture.photos.photo import encode_srgb
 from viewer.display import layers
 from viewer.display.layers import (
     FIRST_FOV,
@@ -147,16 +145,6 @@ def test_the_page_follows_a_run_from_nothing_to_the_way_to_its_stage(tmp_path, t
     page.choose_photo(4)
     np.testing.assert_allclose(page._lamp.handle.position, light_position(page._lights[4].light, page._scale))
     assert truth.calibration.lights[4].photo in page.controls._caption.content
-
-
-def test_photos_show_as_they_are_read_before_there_are_lights(tmp_path, truth, server):
-    page = Page(tmp_path, server)
-    (tmp_path / "thumbs").mkdir()
-    for count, name in enumerate(("a.jpg", "b.jpg", "c.jpg"), start=1):
-        Image.fromarray(encode_srgb(truth.stack.rgb[count])).save(tmp_path / "thumbs" / name)
-        page.refresh()
-        assert page.controls.photo_index() == count - 1 and name in page.controls._caption.content
-        assert page.controls._photo.image.shape == truth.stack.rgb[count].shape
 
 
 def test_a_damaged_file_does_not_end_the_page(tmp_path, truth, server):
