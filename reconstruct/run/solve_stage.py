@@ -56,6 +56,8 @@ KEPT_OBJECT_POSE = "checkpoint_object_pose"  # file of a pose's own solve, while
 NOT_JOINED = "mesh.ply"  # of a pose that could not be laid on the others, in a folder of its name
 
 ObjectPoses = tuple[tuple[str, Scenes], ...]  # name and scenes of each further pose, in its own world
+# Of torch: sums depend on it, and a kernel that numba ran in parallel before would leave OpenMP as many as cores.
+THREADS = torch.get_num_threads()
 LOOK_EVERY_S = 0.25  # while paused
 Continued = Callable[[FitConfig, int, str], FitConfig | None]  # schedule, levels done, preset: see presets.continued
 EARLIER = "checkpoint_earlier.safetensors"  # state of a solve when a visitor of the page chose another resolution
@@ -270,6 +272,7 @@ def solve(
     Raises:
         UserError: as `fit` and `train`, or a photo cannot be read.
     """
+    torch.set_num_threads(THREADS)
     device = (training_device if options.is_trained() else solver_device)(options.device)
     checkpoint, doubts = run.file("checkpoint.safetensors"), ()
     while True:
