@@ -40,6 +40,7 @@ LIMITS = {"lights_pct": 6.0, "iou": 0.95, "depth_pct": 3.0, "normals_deg": 15.0}
 CAUSES = {  # what is wrong in truth, and the words by which a verdict names it
     "lights": r"lights?' (places?|positions?)|where the (lights?|flashlight) (is|are)|usable light|wrong lights?",
     "outline": r"outline|what is (object|ground|table)|taken for (ground|table|object)|object's (shape|edge)",
+    "shape": r"the surface('s slopes| does not explain)",
     "bad photo": r"\barm\b|hand in|shak|did not fire|flash.* off|photos? (was|were|is|are) (wrong|bad)",
     "moved camera": r"tripod|camera (moved|was moved)",
     "mixed light": r"room light|mixed light|another lamp",
@@ -107,8 +108,9 @@ def scored(out: Path, capture: Path, code: int, said: str, factors: dict[str, st
     """Compare a run with the truth, and what it says of itself with what is wrong."""
     from reconstruct.evaluate.metrics import evaluate
 
-    verdict = json.loads((out / "check.json").read_text()) if (out / "check.json").exists() else {}
-    row: Row = {"grade": verdict.get("verdict", "none"), "said": verdict.get("sentence", "")}
+    file = out / "report.json"
+    verdict = json.loads(file.read_text()) if file.exists() else {}
+    row: Row = {"grade": verdict.get("grade", "none"), "said": verdict.get("verdict", "")}
     if code != 0:
         row |= {"grade": "refused" if code == 2 else "crashed", "said": said.strip().splitlines()[-1:]}
         row["said"] = (row["said"] or [""])[0]

@@ -10,6 +10,7 @@ if not __package__:  # started by its path: the checkout is where the other pack
     sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 OUTPUT = 1  # the number of the standard output
+CLOSED = 128 + 13  # the exit code of a command that SIGPIPE ends, which Windows does not know
 SHOW_CURSOR = b"\x1b[?25h"  # a progress bar hides it
 
 
@@ -27,6 +28,8 @@ def start() -> int:
         return main()
     except KeyboardInterrupt:  # before the command had begun
         return 128 + signal.SIGINT
+    except BrokenPipeError:  # who reads the output, as `head` does, has seen enough
+        os._exit(CLOSED)  # Python would print another traceback when it flushes the output at the end
     finally:
         signal.signal(signal.SIGINT, signal.SIG_DFL if is_heard else signal.SIG_IGN)
 

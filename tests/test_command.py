@@ -105,6 +105,14 @@ def test_threads_of_other_libraries_wait_asleep_unless_the_user_said_otherwise(g
     assert done.stdout.split() == [given or "PASSIVE", "False"], done.stderr
 
 
+def test_a_reader_that_has_seen_enough_of_the_output_ends_a_command_without_a_traceback():
+    words = [sys.executable, str(ROOT / "shadowgraph"), "run", "--help"]
+    started = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert started.stdout is not None and started.stderr is not None
+    started.stdout.close()
+    assert (started.stderr.read(), started.wait(600)) == ("", 141)
+
+
 def test_names_of_the_facade_are_those_of_their_modules_and_another_is_refused():
     for name, module in shadowgraph.FACADE.items():
         assert getattr(shadowgraph, name) is getattr(importlib.import_module(module), name)

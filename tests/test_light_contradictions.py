@@ -57,6 +57,9 @@ def test_a_light_that_is_off_by_seven_degrees_is_named(about):
 def test_a_surface_that_misses_held_out_shadows_says_so():
     assert misfit({"loss_held_out": 0.05}) == [] and misfit({}) == []
     assert "wrong by 18 %" in misfit({"loss_held_out": 0.18})[0]
+    chord = 2 * np.sin(np.radians([14.9, 25.0]) / 2)
+    assert misfit({"loss_normal": chord[0] ** 2}) == []
+    assert "slopes are 25 degrees off" in misfit({"loss_normal": chord[1] ** 2})[0]
 
 
 def test_pieces_in_the_air_are_warned_of_and_objects_on_the_ground_are_not():

@@ -132,21 +132,26 @@ def test_a_photo_is_a_stray_where_less_of_its_ground_follows_than_of_the_others(
     np.testing.assert_array_equal(np.flatnonzero(does_not_follow(fit)), [5])
 
 
-def test_fits_are_compared_by_the_cells_that_they_are_fitted_to(ball):
-    """A tenth more of misfit is worth log(1.1) for each independent cell, and outlines weigh against it.
+def test_a_light_that_is_lost_is_looked_for_wherever_a_hand_reaches(ball):
+    _, lights, maps = ball
+    fit, evidence = _with_one_lost(maps, lights, 3)
+    found = joint_search._elsewhere((0.0, fit, joint_search.NOISE), evidence)
+    assert min(_off(one.flashlights.positions, lights)[3] for _, one, _ in found) < 0.1
+    mixed = joint_search._best_of_each((0.0, fit, joint_search.NOISE), [(0.0, fit, 0.0), *found], evidence)
+    assert _off(mixed.positions, lights).max() < 0.15 < 0.5 < _off(fit.flashlights.positions, lights)[3]
 
-    Up to a constant. The count is that of the fits, whatever the misfit: compared by fewer cells than they are fitted
-    to, fits with better outlines and far worse shading win, and lights end up tens of per cent away.
-    """
+
+def test_fits_are_compared_by_the_cells_that_they_are_fitted_to(ball):
+    """A photo's misfit times k costs log k for each of its independent cells, and outlines weigh against it."""
     _, lights, maps = ball
     evidence = _shaded(maps, lights)
     state = Flashlights(lights, 0 * lights, np.zeros(len(lights)), np.zeros(4), 0.0, np.zeros(3))
     fit = FlashlightFit(state, evidence, evidence.weight, ALIKE_POWER, free_tangent)
-    for misfit in (0.3, 2.0, 4.0):  # of noise
-        found = [(0.0, fit, misfit * joint_search.NOISE), (1.5, fit, 1.1 * misfit * joint_search.NOISE)]
-        cells = (evidence.weight > 0).sum() / joint_search.alike(evidence.weight)
-        gap = np.diff(joint_search._posteriors(found, evidence))
-        np.testing.assert_allclose(gap, 1.5 + cells * np.log(1.1), rtol=1e-9)
+    cells = (evidence.weight > 0).sum(1) / joint_search.alike(evidence.weight)
+    for times in (1.1, 4.0):
+        worse = replace(fit, evidence=replace(evidence, log_grey=evidence.log_grey + (times - 1) * fit.residual()))
+        gap = np.diff(joint_search._posteriors([(0.0, fit, 0.0), (1.5, worse, 0.0)], evidence))
+        np.testing.assert_allclose(gap, 1.5 + cells.sum() * np.log(times), rtol=1e-9)
 
 
 def test_the_variance_of_a_mixture_is_about_the_fit_that_is_chosen():

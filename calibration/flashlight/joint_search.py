@@ -5,7 +5,7 @@ Photos that are at odds add none.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from calibration.flashlight.beam_profile import EXTRA_TERMS, SMOOTH_TERMS
 from calibration.flashlight.descent import refine
 from calibration.flashlight.fit import (
     ALIKE_POWER,
+    DIRECTIONS,
     FAR,
     NEAR,
     START_AMBIENT,
@@ -23,10 +24,21 @@ from calibration.flashlight.fit import (
     alike,
     variance_about,
 )
-from calibration.flashlight.model import LAMP, NOISE, Evidence, Flashlights, Samples, cell_residuals, cost
-from calibration.flashlight.pictured import bent, places_held, without_wall
+from calibration.flashlight.model import (
+    LAMP,
+    NOISE,
+    Evidence,
+    Flashlights,
+    Samples,
+    cell_residuals,
+    cost,
+    log_albedo,
+    log_irradiance,
+)
+from calibration.flashlight.pictured import bent, own_tangent, places_held, without_wall
 from calibration.flashlight.wall import WALL_TERMS, Wall
 from calibration.lights import hand
+from calibration.lights.response import bend
 from capture.checks.robust import spread
 
 LOG = logging.getLogger(__name__)
@@ -40,6 +52,9 @@ SCATTER = 15.0  # of the negative log posterior: searches in ten simulated captu
 FARTHER = (0.5, 0.6, 0.72, 0.85, 1.0, 1.18, 1.4, 1.65, 2.0)  # along what outlines leave free: a hand's range
 HOPS = (0.7, 0.85, 1.18, 1.4)  # likewise, from a fit on: half a stop and one, of what the ground receives
 ROUNDS = 10  # of other walls and distances, at most
+BESIDE = np.radians(15.0)  # between neighbours of a grid of places: DIRECTIONS lie as far apart, ...
+REACHES = np.exp(np.arange(np.log(hand.NEAREST), np.log(hand.FARTHEST), BESIDE))  # ... and distances (mm), as a share
+PLACES = 4  # of each light, in different directions or distances: where its photo's shading may have a minimum
 EVERY = 4  # of the cells, and of the outlines' rays: neighbours err together (SAME of outlines.terms)
 COMPARED = 4  # fits, of which a light is taken from where it explains its photo best
 GAINED = 3.0  # of the negative log posterior, strong evidence [Kass and Raftery 1995]: a last round lowers it less
@@ -58,9 +73,9 @@ def searched(
     what distance, beam and response make of one another. What both allow is narrow. First each start follows the
     outlines alone, with a sigma that falls to their own (graduated non-convexity) [Blake and Zisserman, Visual
     Reconstruction (1987)]. In rounds all lights of each line are then tried at other distances, with a wall, and each
-    light where another fit has it; the most probable are fitted to both. The worse half of the lines ends with each
-    round (successive halving) [Jamieson and Talwalkar, AISTATS (2016)]. `between` of the fit holds what all fits say
-    that explain the photos about as well.
+    light where another fit has it or where its own photo alone leads it; the most probable are fitted to both. The
+    worse half of the lines ends with each round (successive halving) [Jamieson and Talwalkar, AISTATS (2016)].
+    `between` of the fit holds what all fits say that explain the photos about as well.
 
     Args:
         starts: positions, world.
@@ -101,8 +116,46 @@ def _improved(best: _Found, found: Sequence[_Found], evidence: Evidence) -> list
     walled = [_shaded(state, state.positions, wall, evidence) for wall in WALLS if state.wall[2] <= 0]
     hops = [one for times in HOPS for one in _both(state, farther(state.positions, evidence, times), evidence)]
     tried = [*_likeliest(walled, evidence, 1), *_likeliest(hops, evidence, 1)]
-    mixed = _settled(_best_of_each(best, found, evidence), evidence, best[2])
+    mixed = _settled(_best_of_each(best, [*found, *_elsewhere(best, evidence)], evidence), evidence, best[2])
     return [mixed, *(_settled(fit.flashlights, evidence, misfit) for _, fit, misfit in tried)]
+
+
+def _elsewhere(best: _Found, evidence: Evidence) -> list[_Found]:
+    """Return fits of each light by itself to its photo's shading, from its likeliest places in a hand's reach.
+
+    One photo's shading has several minima, and outlines hold a light in a false one while other lights are still off.
+    Albedo, beam, response and wall are the best fit's, so that a grid tells each light's places without a fit.
+    """
+    (_, fit, misfit), centre = best, evidence.cells.centre
+    state, albedo = fit.flashlights, log_albedo(fit.flashlights, evidence, fit.weight)
+    grid = np.concatenate([centre + reach * DIRECTIONS for reach in REACHES])
+    power = np.full(len(grid), np.median(state.log_power))
+    there = replace(state, positions=grid, targets=np.repeat(state.aim[None], len(grid), 0), log_power=power)
+    chosen = np.zeros((PLACES, len(state.positions)), int)
+    for photo, shown in enumerate(_pictured_from(there, state, evidence)):
+        off = (evidence.log_grey[photo] - albedo - shown)[:, evidence.weight[photo] > 0]
+        order = np.median(np.abs(off - np.median(off, axis=1, keepdims=True)), axis=1).argsort()
+        for rank in range(PLACES):
+            chosen[rank, photo] = order[0]
+            apart = np.linalg.norm(grid[order] - grid[order[0]], axis=1)
+            order = order[apart > BESIDE * np.linalg.norm(grid[order[0]] - centre)]
+    alone, found = replace(_weighted(evidence, misfit), outlines=None), []
+    for some in chosen:
+        moved = replace(there, positions=grid[some], targets=there.targets[some], log_power=power[some])
+        new, weight = refine(moved, alone, ALIKE_POWER, own_tangent, FAR[:6] + NEAR[-2:])
+        found.append(_judged(new, evidence, weight))
+    return found
+
+
+def _pictured_from(
+    there: Flashlights, flashlights: Flashlights, evidence: Evidence
+) -> Iterator[Float[np.ndarray, "places cells"]]:
+    """Yield for each photo what log_pictured would show of it, were its light any of those `there`."""
+    light, among = log_irradiance(there, evidence), log_irradiance(flashlights, evidence)
+    exposure = np.zeros(len(among)) if evidence.exposure is None else evidence.exposure
+    middle = np.median(among + exposure[:, None])
+    for one in exposure:
+        yield light + bend(light + (one - middle), flashlights.response) if len(flashlights.response) else light
 
 
 def settled(start: Flashlights, evidence: Evidence) -> FlashlightFit:
@@ -178,14 +231,12 @@ def _best_of_each(best: _Found, found: Sequence[_Found], evidence: Evidence) -> 
     """
     terms, state = evidence.outlines, best[1].flashlights
     assert terms is not None
-    cells = (evidence.weight > 0).sum(1) / alike(evidence.weight)
-    own = np.eye(len(cells)) > 0
+    own = np.eye(len(state.positions)) > 0
     costs = []
     for _, fit, _ in found:
-        misfit = [spread(r[w > 0]) if (w > 0).any() else LOST for r, w in zip(fit.residual(), fit.weight, strict=True)]
         moved = np.where(own[..., None], fit.flashlights.positions, state.positions)
         shadows = [replace(terms, trusted=terms.trusted | one).cost(at) for one, at in zip(own, moved, strict=True)]
-        costs.append(cells * np.log(np.maximum(misfit, NO_GROUND)) + shadows)
+        costs.append(_by_shading(fit, evidence) + shadows)
     chosen = np.argmin(costs, axis=0)
 
     def taken(values: Sequence[np.ndarray]) -> np.ndarray:
@@ -203,13 +254,22 @@ def _best_of_each(best: _Found, found: Sequence[_Found], evidence: Evidence) -> 
 def _posteriors(found: Sequence[_Found], evidence: Evidence) -> Float[np.ndarray, " found"]:
     """Return the negative log posteriors of fits to the same evidence, up to a constant that they share.
 
-    The shading counts as cells whose errors are independent, as many as in the fits themselves: log(misfit) for each. A
-    wall pays for its terms [Schwarz, Estimating the Dimension of a Model, Annals of Statistics 6 (1978)].
+    A wall pays for its terms [Schwarz, Estimating the Dimension of a Model, Annals of Statistics 6 (1978)].
     """
-    misfit = np.maximum([one[2] for one in found], NO_GROUND)
     cells = (evidence.weight > 0).sum() / alike(evidence.weight)
-    walls = np.array([one[1].flashlights.wall[2] > 0 for one in found])
-    return np.array([one[0] for one in found]) + cells * np.log(misfit) + walls * WALL_TERMS / 2 * np.log(cells)
+    walls = np.array([fit.flashlights.wall[2] > 0 for _, fit, _ in found])
+    shading = np.array([_by_shading(fit, evidence).sum() for _, fit, _ in found])
+    return np.array([one[0] for one in found]) + shading + walls * WALL_TERMS / 2 * np.log(cells)
+
+
+def _by_shading(fit: FlashlightFit, evidence: Evidence) -> Float[np.ndarray, " photos"]:
+    """Return the negative log likelihood of each photo's shading, up to a constant.
+
+    A photo counts as cells whose errors are independent, of a size of its own: log(misfit) for each.
+    """
+    known = evidence.weight > 0
+    misfit = [spread(r[k]) if k.any() else 1.0 for r, k in zip(fit.residual(), known, strict=True)]
+    return known.sum(1) / alike(evidence.weight) * np.log(np.maximum(misfit, NO_GROUND))
 
 
 def _likeliest(found: Sequence[_Found], evidence: Evidence, count: int) -> list[_Found]:

@@ -111,3 +111,8 @@ def places_held(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
     n, free = len(flashlights.positions), flashlights.per_flashlight() - 1
     columns = np.arange(basis.shape[1])
     return basis[:, (columns >= free * n) | (columns % free >= 3)]
+
+
+def own_tangent(flashlights: Flashlights) -> Float[np.ndarray, "full own"]:
+    """Return the columns of free_tangent that move each light by itself, and nothing that all share."""
+    return free_tangent(flashlights)[:, : (flashlights.per_flashlight() - 1) * len(flashlights.positions)]

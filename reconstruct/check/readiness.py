@@ -46,14 +46,19 @@ class Readiness:
         used, photos = self.facts["photos_used"], self.facts["photos"]
         if len(self.reasons) == 0:
             return f"Good: {used} of {photos} photos can be used, and light came from all sides."
-        further = len(self.reasons) - 1
-        more = f", and for {further} more reason{'s' * (further > 1)}" if further else ""
-        return f"{self.grade.capitalize()}: {self.reasons[0]}{more}."
+        return in_one_sentence(self.grade, self.reasons)
 
     def document(self) -> dict[str, Any]:
         """Return the verdict as check.json stores it."""
         words = {"verdict": self.grade, "sentence": self.sentence(), "reasons": self.reasons, "advice": self.advice}
         return {"format": 1, **words, "numbers": self.facts}
+
+
+def in_one_sentence(grade: str, reasons: Sequence[str]) -> str:
+    """Return a verdict in one sentence: its grade, the first of its reasons, and how many more there are."""
+    further = len(reasons) - 1
+    more = f", and for {further} more reason{'s' * (further > 1)}" if further else ""
+    return f"{grade.capitalize()}: {reasons[0].rstrip('.')}{more}."
 
 
 def powers_mean_nothing(calibration: Calibration) -> bool:

@@ -1,28 +1,15 @@
 """A shadow hull bent to the normals that one camera sees: the first surface of a solve.
 
-The hull of several views is tight, and nothing ties the depth of one view's integral to what the others see: bent by
-each in turn, a head of 50 mm became hollow. They are not bent.
+The hull of several views is tight, and nothing ties the depth of one view's integral to what the others see: they are
+not bent.
 
-One view's surface is held to its hull where both have one normal, and from the second round on where rays tell that the
-hull's matter is there; elsewhere the hull only bounds it, `integrate_within`. Tied to the hull everywhere, as it was
-before, the first surface of a bowl was off by 22 mm, now by 6; of hard_table 6.6 and 2.4, of a chair 5.5 and 7.4.
-
-Under few lights the hull has normals of its own, so that hardly anything tells it from matter that is not there: a head
-before a body sank by 25 mm or not, by a hair. So it is tied to the hull everywhere, unless the shadows on the ground,
-which no bend follows, clearly contradict that: of a hard table's 8 lights tied had an error of .042, held where it is
-likely .011. Third, it is made anew behind the integral, `on_front`: an ear had .025, anew .013; a head .009, anew .028.
-Made with 10 lights and depth errors: held .032, tied .007, anew .013. With 17 and 20 lights a ball on a body had errors
-of .039 and .036, tied .013 and .009; a vase of 19 lights 2.9 mm, tied 3.9.
-
-Likewise for the normals of shadow pictures, `integrate_behind`: a dome over a flat top had an error of .095, bent .062;
-a round body .033 and .030.
-
-A hull behind the integral of normals: the start where few lights leave the depth of what the camera sees open.
-
-Five lights prove little of the space along a ray empty, and ground that is dark by chance makes wrong places on it as
-likely as the right one: an ear became a fan of shreds, in front of its place and behind it. What a camera sees is, for
-the most part, one surface, though. Its depth is integrated from the normals of shading, over what is no break in
-shading, and the hull is made anew behind it. How thick it is there, nothing says: it is taken to be as thick as wide.
+One view's hull is bent in up to three ways. The normals' integral lies behind the hull and touches it where both have
+one normal or where rays tell that the hull's matter is there (`integrate_within`). Up to FEW_LIGHTS the hull has
+normals of its own, which hide that; so the integral is tied to it everywhere (`integrate_normals`), or the hull is made
+anew behind the integral (`on_front`): what a camera sees is mostly one surface, as thick as wide. Shadow pictures have
+`integrate_behind`. Shadows on the ground follow no bend, so they judge: a bend that explains them clearly worse than
+another, or than the hull as it was carved, is left. So wrong normals, as of a front in the bounce of a white table, do
+not ruin a right hull.
 """
 
 from collections.abc import Callable, Sequence
@@ -57,8 +44,8 @@ JUDGES_SEED = 1  # beside the seed, for the rays that judge the two surfaces: ot
 # Single pixels, px and share of them: judged in blocks, at a lower sharpness, a relief lost a degree.
 JUDGES_BLOCK, JUDGES_SHARE = 1, 0.05
 FEW_LIGHTS = 20  # up to which the hull has normals of its own
-CLEARLY = 0.85  # of a hull's shadow error: it is taken bent below it; .79 was better
-BENT_CLEARLY = 0.65  # the same for another bend: of better ones it was .57 at most, of worse ones .73
+CLEARLY = 0.85  # of a hull's shadow error: shadow pictures bend it below that
+BENT_CLEARLY = 0.65  # of a bend's: another bend, or the hull itself, is taken below that; bends hold more than shadows
 Say = Callable[[str], None]  # takes a sentence about the step that begins
 Seen = tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]  # see Observer.seen
 Bend = Callable[[SdfGrid, Seen, Labels], SdfGrid]  # bends the surface
@@ -130,7 +117,7 @@ class BentHull:
     say: Say
 
     def found(self, hull: SdfGrid, space: SdfGrid) -> SdfGrid:
-        """Return the hull, bent; itself if the normals of shadow pictures make it no better.
+        """Return the hull, bent; itself if shadows on the ground contradict its bends.
 
         Args:
             hull: on the first level's grid.
@@ -146,7 +133,7 @@ class BentHull:
             first = observer.seen(space)[0]
             bends.insert(0, self._along(partial(integrate_normals, bounds=True)))
             bends.append(lambda _, seen, labels: on_front(hull, space, scene, seen, first, labels))
-        return self._best([self._rounds(hull, side, read, bend) for bend in bends], BENT_CLEARLY)
+        return self._best([*(self._rounds(hull, side, read, bend) for bend in bends), hull], BENT_CLEARLY)
 
     def _along(self, integrate: Integrate) -> Bend:
         """Return what bends the present surface to the integral of the labels' normals."""

@@ -13,6 +13,7 @@ from calibration.board.board_scale import scale_sentence
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
 from capture.files.schema import read_kept
+from reconstruct.check.readiness import GRADES, in_one_sentence
 from reconstruct.fields import SolvedScene
 from reconstruct.mesh.evidence import KINDS, UNCONSTRAINED, volume_sigma
 from reconstruct.run_folder.folder import LOG, PLAN, RunFolder, read_log
@@ -23,6 +24,7 @@ from reconstruct.stored_run.documents import CHECK, read_check
 
 NAMES = ("shadowgraph", "numpy", "torch", "numba", "opencv-contrib-python-headless", "trimesh", "viser")
 MISFIT = 0.1  # of held-out shadow rays: captures with right lights leave .002 to .05
+SLOPE = np.radians(15.0)  # between the surface's slopes and those of shading: a shape that is off by more fails
 LARGEST_PART = 0.8  # of the area: where no ground is known, a surface is one piece
 IN_THE_AIR = 2.0  # voxels above the ground
 FEW_LIGHTS = 10  # fewer leave the depth of some parts open
@@ -46,6 +48,18 @@ def summary(
     views = {view.name: view.calibration for view in calibrated.every()}
     notes, warnings = (_said(calibrated, key) for key in ("notes", "warnings"))
     names = {calibrated.views[0].name, *(view.view for view in solved.views())}
+    after = [
+        *plain(warnings),
+        *(reason for _, reason in calibrated.left_out),
+        *([plan.sentence] if plan and OVERRIDE in plan.sentence else []),
+        *solved.doubts,
+        *pieces(mesh, solved),
+        *guessed(mesh),
+        *undersides(mesh, solved),
+        *_requests(run),
+        *(f"{x.photo}: {x.reason}" for one in views.values() for x in one.lights if x.used and x.reason),
+    ]
+    grade, warnings = _verdict(read_check(check) if check.is_file() else {}, misfit(_last_numbers(run)), after)
     return {
         "format": 1,
         "capture": source.folder.resolve().name,
@@ -62,23 +76,9 @@ def summary(
         "calibration": residuals,
         **_of_views(calibrated, solved),
         "assumptions": plain(notes),
-        "warnings": list(
-            dict.fromkeys(
-                [
-                    *plain(warnings),
-                    *(reason for _, reason in calibrated.left_out),
-                    *(read_check(check)["reasons"] if check.is_file() else []),  # which hold the warnings too
-                    *([plan.sentence] if plan and OVERRIDE in plan.sentence else []),
-                    *solved.doubts,
-                    *misfit(_last_numbers(run)),
-                    *pieces(mesh, solved),
-                    *guessed(mesh),
-                    *undersides(mesh, solved),
-                    *_requests(run),
-                    *(f"{x.photo}: {x.reason}" for one in views.values() for x in one.lights if x.used and x.reason),
-                ]
-            )
-        ),
+        "verdict": in_one_sentence(grade, warnings) if warnings else "",
+        "grade": grade,
+        "warnings": warnings,
         "fit": _last_numbers(run),
         "refined_lights": plain(_refined_lights(calibration, solved)),
         "light_trial": trial and {"accepted": trial.is_accepted, "sentence": trial.sentence()} | asdict(trial),
@@ -91,6 +91,22 @@ def summary(
         | _evidence(mesh),
         "versions": {"python": platform.python_version()} | versions(),
     }
+
+
+def _verdict(checked: dict[str, Any], misfits: list[str], after: list[str]) -> tuple[str, list[str]]:
+    """Return one of GRADES and all warnings, the worst first.
+
+    Args:
+        checked: the verdict before the solve, whose reasons hold the calibration's warnings, too.
+        misfits: what the solved surface does not explain.
+        after: other warnings.
+    """
+    grade, before = str(checked.get("verdict") or GRADES[0]), checked.get("reasons", [])
+    if misfits and grade in GRADES[:2]:
+        grade, before = GRADES[2], [*misfits, *before]
+    elif after and grade == GRADES[0]:
+        grade = GRADES[1]
+    return grade, list(dict.fromkeys([*before, *misfits, *after]))
 
 
 def _photos(calibration: Calibration, view: str, is_solved: bool) -> list[dict[str, Any]]:
@@ -199,15 +215,23 @@ def _refined_lights(calibration: Calibration, solved: SolvedScene) -> list[dict[
 
 
 def misfit(numbers: dict[str, float]) -> list[str]:
-    """Return a warning if the surface does not explain shadows that were held out from the fit."""
-    error = numbers.get("loss_held_out", 0.0)
-    if error < MISFIT:
-        return []
-    return [
-        "the surface does not explain its photos: shadows that were set aside for a test are wrong by "
-        f"{100 * error:.0f} % (below {100 * MISFIT:.0f} % was needed, 1 % is usual). Do not trust this shape: lights, "
-        "ground or the object's mask are wrong. Look at the lights in report.html."
-    ]
+    """Return warnings if the surface does not explain shadows that were held out from the fit, or the shading."""
+    error, found = numbers.get("loss_held_out", 0.0), []
+    if error >= MISFIT:
+        found.append(
+            "the surface does not explain its photos: shadows that were set aside for a test are wrong by "
+            f"{100 * error:.0f} % (below {100 * MISFIT:.0f} % was needed, 1 % is usual). Do not trust this shape: "
+            "lights, ground or the object's mask are wrong. Look at the lights in report.html."
+        )
+    chord = min(numbers.get("loss_normal", 0.0) ** 0.5, 2.0)  # between unit normals, root mean square
+    slope = 2 * np.arcsin(chord / 2)
+    if slope >= SLOPE:
+        found.append(
+            f"the surface's slopes are {np.degrees(slope):.0f} degrees off those that the photos' shading shows (root "
+            f"mean square; below {np.degrees(SLOPE):.0f} was needed). Do not trust this shape: compare it with the "
+            "photos in report.html."
+        )
+    return found
 
 
 def pieces(mesh: trimesh.Trimesh, solved: SolvedScene) -> list[str]:

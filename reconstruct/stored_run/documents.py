@@ -71,6 +71,7 @@ class _Report(Struct):
 
     error: Text | None = None
     verdict: Text | None = None
+    grade: Text | None = None
     command: Text | None = None
     capture: Text | None = None
     unit: Text | None = None

@@ -1,9 +1,9 @@
 """report.html: what a run found and how far it can be trusted, for readers without knowledge of calibration.
 
 Read from the files of the run folder, whichever are there: a run that failed gets a report, too. report.json may hold
-`error`, `verdict`, `warnings` [text], `assumptions` [text], `stages` {name: {seconds, cpu_seconds, peak_memory_bytes}},
-`photos` [{name, role, used, reason}], `fit` {name: number}, `versions` {name: text}, `command` and the SETTINGS;
-every key is optional.
+`error`, `verdict`, `grade`, `warnings` [text], `assumptions` [text], `stages` {name: {seconds, cpu_seconds,
+peak_memory_bytes}}, `photos` [{name, role, used, reason}], `fit` {name: number}, `versions` {name: text}, `command` and
+the SETTINGS; every key is optional.
 """
 
 from collections.abc import Callable
@@ -17,6 +17,7 @@ import trimesh
 from calibration.calibration import Calibration, load_calibration
 from capture.errors import UserError
 from capture.files.atomic import atomic_file
+from reconstruct.check.readiness import GRADES
 from reconstruct.fields import SolvedScene
 from reconstruct.source.source import RunOptions
 from reconstruct.stored_run.documents import MANIFEST, REPORT
@@ -143,7 +144,7 @@ def _verdict(results: Results) -> tuple[str, str]:
         return f"There is no mesh. {status(results.log, is_running=False).title}.", "bad"
     warnings = len(_warnings(results))
     if report.get("verdict"):
-        return str(report["verdict"]), "warn" if warnings else ""
+        return str(report["verdict"]), "bad" if report.get("grade") in GRADES[2:] else "warn"
     if warnings:
         remarks = "remark" if warnings == 1 else f"{warnings} remarks"
         return f"A mesh was made. Read the {remarks} below before you rely on it.", "warn"
