@@ -106,6 +106,43 @@ def test_a_hollow_lies_below_the_lid_that_a_hull_puts_on_it(block):
     assert within[beside].mean() < 0.3 * PIXEL < 3 * PIXEL < tied[beside].mean()
 
 
+def test_the_inside_of_a_cup_is_found_under_a_lid_that_touches_its_near_rim_only():
+    """Its rim, in one piece all around, carries the depth of the far wall; the near rim stands before the inside."""
+    outer, inner, high, eye = 40.0, 36.0, 80.0, np.array([0.0, -200.0, 230.0])
+    forward = np.array([0.0, 0.0, 50.0]) - eye
+    forward /= np.linalg.norm(forward)
+    right, down = np.array([1.0, 0.0, 0.0]), np.cross(forward, [1.0, 0.0, 0.0])
+    u, v = np.meshgrid(np.linspace(-0.2, 0.2, 72), np.linspace(-0.26, 0.2, 84))
+    along = forward + u[..., None] * right + v[..., None] * down
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+
+    def through(radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """Lengths at which rays enter and leave an endless cylinder; nan beside it."""
+        a, b = (along[..., :2] ** 2).sum(-1), (along[..., :2] * eye[:2]).sum(-1)
+        root = np.sqrt(np.where((c := b**2 - a * ((eye[:2] ** 2).sum() - radius**2)) > 0, c, np.nan))
+        return (-b - root) / a, (-b + root) / a
+
+    def at(length: np.ndarray) -> np.ndarray:
+        return eye + length[..., None] * along
+
+    (front, _), (_, back) = through(outer), through(inner)
+    rim = (high - eye[2]) / along[..., 2]
+    wide = np.linalg.norm(at(rim)[..., :2], axis=-1)
+    side = np.isfinite(front) & (at(front)[..., 2] < high) & (at(front)[..., 2] > 0)
+    top, inside = (wide >= inner) & (wide <= outer), (wide < inner) & (at(back)[..., 2] > 0)
+    length = np.where(top, rim, np.where(inside, back, np.where(side, front, np.nan)))
+    radial = at(length) * [1, 1, 0] / np.linalg.norm(at(length)[..., :2], axis=-1, keepdims=True)
+    normals = np.nan_to_num(np.where(top[..., None], [0.0, 0.0, 1.0], np.where(inside[..., None], -radial, radial)))
+    leaning = np.array([0.0, -0.5, 1.0]) / 1.25**0.5
+    lid = ((np.array([0.0, -outer, high]) - eye) @ leaning) / (along @ leaning)
+    covered = (top | inside) & (lid < length)
+    hull, own = np.where(covered, lid, length), np.where(covered[..., None], leaning, normals)
+    found = integrate_within(along, hull, own, normals, np.full(hull.shape, SURE))
+    assert np.median((length - hull)[inside]) > 40
+    assert np.median(np.abs(found - length)[inside]) < 5
+    assert np.nanmedian(np.abs(found - length)[side & ~inside & ~top]) < 0.5
+
+
 def test_what_is_in_front_of_a_hull_weighs_more(block):
     along, length, normals = rays_and_lengths(*block)
     uneven = length + np.where(np.arange(length.shape[1]) % 2 > 0, 2.0, -2.0)

@@ -17,7 +17,8 @@ from capture.checks.robust import geman_mcclure
 ROUNDS = 6  # of reweighting
 BREAK = 2.0  # pixels between the tangent planes of neighbours that are on different surfaces, before and after
 GUESSED = 2 * BREAK  # pixels of empty space before a depth that is a guess: its breaks are guesses, too
-GUESSED_WIDTHS = (np.inf, 30.0, 9.0)  # of BREAK, for pairs with such a depth, in rounds before the others
+GUESSED_WIDTHS = (np.inf, *np.geomspace(30.0, 1.4, 9))  # of BREAK, for pairs with such a depth, in rounds before others
+NORMAL_NOISE = 0.12  # rad, one sigma of a photometric normal: NORMAL_SIGMA of labels.photometric_stereo
 TOUCHING = 10.0  # times heavier when in front of a bound, where nothing can be, than behind it
 OUTSIDE = 1000.0  # of the usual tie, in front of a hull that shadows carved; and where the surface touches that hull
 LIKELY, THERE = 0.5, 0.3  # belief in matter from which the surface is held to it, per squared pixel
@@ -178,9 +179,11 @@ def _chords(
 ) -> _Chords:
     """Return (n_p + n_q) / 2 . (t_q d_q - t_p d_p) of neighbouring pixels p, q, in pixels of the picture.
 
-    The chord between two points of a curve is perpendicular to the mean of its normals there. The residual of the
-    present surface's own normals, at edges, is to be subtracted, so that a surface that already has the given normals
-    does not move.
+    The chord between two points of a curve is perpendicular to the mean of its normals there. Where these differ by an
+    angle, it may have any slope between the two tangent planes: it weighs less by that variance, angle^2 / 12, over
+    that of a normal. So a surface breaks at creases first: the far wall of a cup hangs on its rim, not on the near one.
+    The residual of the present surface's own normals, at edges, is to be subtracted, so that a surface that already has
+    the given normals does not move.
     """
     where = np.isfinite(before)
     d, t0, sure = rays[where].astype(np.float64), before[where], trust[where]
@@ -188,8 +191,9 @@ def _chords(
     p, q = _neighbours(where)
     size = np.median(np.linalg.norm(d[p] - d[q], axis=1)) * t0
     worth = np.maximum(sure, OWN_NORMAL)
-    weight = (worth[p] + worth[q]) / 2
-    chord = (worth[p, None] * n[p] + worth[q, None] * n[q]) / (2 * weight * size[p])[:, None]
+    turn = np.arccos(np.clip((n[p] * n[q]).sum(1), -1, 1))
+    weight = (worth[p] + worth[q]) / 2 / (1 + (turn / NORMAL_NOISE) ** 2 / 12)
+    chord = (worth[p, None] * n[p] + worth[q, None] * n[q]) / ((worth[p] + worth[q]) * size[p])[:, None]
     own_chord = own[where][p] + own[where][q]
     apart = (own_chord * (t0[q, None] * d[q] - t0[p, None] * d[p])).sum(1) / (2 * size[p])
     rows, ends = np.arange(len(p)), np.stack([q, p], -1).ravel()
