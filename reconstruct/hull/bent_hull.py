@@ -173,8 +173,6 @@ class BentHull:
         Args:
             clearly: of the least error so far; a later grid is taken below it.
         """
-        if len(grids) == 1:
-            return grids[0]
         rays = supervise(self.scene, self.observer.ground_labels())
         width, count = self.scene.camera.width, len(self.scene.lights)
         drawn = draw_blocks(rays.pixels, width, count, (self.config.seed, JUDGES_SEED), JUDGES_BLOCK, JUDGES_SHARE)

@@ -13,12 +13,12 @@ from scipy.sparse import csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import cg, spsolve
 
 from capture.checks.robust import geman_mcclure
+from reconstruct.labels.photometric_stereo import NORMAL_SIGMA
 
 ROUNDS = 6  # of reweighting
 BREAK = 2.0  # pixels between the tangent planes of neighbours that are on different surfaces, before and after
 GUESSED = 2 * BREAK  # pixels of empty space before a depth that is a guess: its breaks are guesses, too
 GUESSED_WIDTHS = (np.inf, *np.geomspace(30.0, 1.4, 9))  # of BREAK, for pairs with such a depth, in rounds before others
-NORMAL_NOISE = 0.12  # rad, one sigma of a photometric normal: NORMAL_SIGMA of labels.photometric_stereo
 TOUCHING = 10.0  # times heavier when in front of a bound, where nothing can be, than behind it
 OUTSIDE = 1000.0  # of the usual tie, in front of a hull that shadows carved; and where the surface touches that hull
 LIKELY, THERE = 0.5, 0.3  # belief in matter from which the surface is held to it, per squared pixel
@@ -192,7 +192,7 @@ def _chords(
     size = np.median(np.linalg.norm(d[p] - d[q], axis=1)) * t0
     worth = np.maximum(sure, OWN_NORMAL)
     turn = np.arccos(np.clip((n[p] * n[q]).sum(1), -1, 1))
-    weight = (worth[p] + worth[q]) / 2 / (1 + (turn / NORMAL_NOISE) ** 2 / 12)
+    weight = (worth[p] + worth[q]) / 2 / (1 + (turn / NORMAL_SIGMA) ** 2 / 12)
     chord = (worth[p, None] * n[p] + worth[q, None] * n[q]) / ((worth[p] + worth[q]) * size[p])[:, None]
     own_chord = own[where][p] + own[where][q]
     apart = (own_chord * (t0[q, None] * d[q] - t0[p, None] * d[p])).sum(1) / (2 * size[p])

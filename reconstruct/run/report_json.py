@@ -59,7 +59,8 @@ def summary(
         *_requests(run),
         *(f"{x.photo}: {x.reason}" for one in views.values() for x in one.lights if x.used and x.reason),
     ]
-    grade, warnings = _verdict(read_check(check) if check.is_file() else {}, misfit(_last_numbers(run)), after)
+    fit = _last_numbers(run)
+    grade, warnings = _verdict(read_check(check) if check.is_file() else {}, misfit(fit), after)
     return {
         "format": 1,
         "capture": source.folder.resolve().name,
@@ -79,7 +80,7 @@ def summary(
         "verdict": in_one_sentence(grade, warnings) if warnings else "",
         "grade": grade,
         "warnings": warnings,
-        "fit": _last_numbers(run),
+        "fit": fit,
         "refined_lights": plain(_refined_lights(calibration, solved)),
         "light_trial": trial and {"accepted": trial.is_accepted, "sentence": trial.sentence()} | asdict(trial),
         "mesh": {
