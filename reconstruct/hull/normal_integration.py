@@ -20,7 +20,9 @@ BREAK = 2.0  # pixels between the tangent planes of neighbours that are on diffe
 GUESSED = 2 * BREAK  # pixels of empty space before a depth that is a guess: its breaks are guesses, too
 GUESSED_WIDTHS = (np.inf, *np.geomspace(30.0, 1.4, 9))  # of BREAK, for pairs with such a depth, in rounds before others
 TOUCHING = 10.0  # times heavier when in front of a bound, where nothing can be, than behind it
-OUTSIDE = 1000.0  # of the usual tie, in front of a hull that shadows carved; and where the surface touches that hull
+OUTSIDE = 1000.0  # of the usual tie, in front of a hull that shadows carved
+# Per squared pixel: a side that touches its hull leaves it by half a pixel if all its normals err by their sigma.
+TOUCH = (NORMAL_SIGMA / 0.5) ** 2
 LIKELY, THERE = 0.5, 0.3  # belief in matter from which the surface is held to it, per squared pixel
 LIKE_HULL = 0.9  # cosine between the normals of hull and shading above which the surface may touch the hull
 WRONG_BOUNDS = 0.05  # share of a hull's pixels that are behind the truth: edges, and beside thin matter that was lost
@@ -102,13 +104,14 @@ def integrate_within(
     where = np.isfinite(hull)
     t0 = hull[where]
     chords = _chords(rays, hull, own, normals, trust)
-    touching = np.maximum(likeness(own, normals, trust)[where], DUST)
-    tie = OUTSIDE * _tie(where, 0)[where] / chords.size**2
+    outside = OUTSIDE * _tie(where, 0)[where] / chords.size**2
+    touching = TOUCH * np.maximum(likeness(own, normals, trust)[where], DUST) / chords.size**2
     held = np.zeros(len(t0), bool) if matter is None else matter[where] > LIKELY
     t = t0 if behind is None else np.where(held | np.isnan(behind[where]), t0, behind[where])
     for wider in (*(GUESSED_WIDTHS if behind is None else ()), *(1.0 for _ in range(ROUNDS))):
         width = wider * BREAK
-        hold = tie * np.where(t < t0, 1, touching * geman_mcclure(((t - t0) / (width * chords.size)) ** 2) + DUST)
+        near = touching * geman_mcclure(((t - t0) / (width * chords.size)) ** 2) + DUST * outside
+        hold = np.where(t < t0, outside, near)
         hold = np.where(held, THERE / chords.size**2, hold)
         t = _reweighted(chords.slope, np.zeros_like(chords.apart), chords.weight, width, hold, t0, t)
     return _spread(t, where)

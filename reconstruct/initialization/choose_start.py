@@ -12,7 +12,7 @@ from torch import Tensor
 from capture.errors import ReconstructionError, Remedy
 from reconstruct.config import FitConfig, Level
 from reconstruct.hull.bent_hull import JUDGES_BLOCK, JUDGES_SEED, JUDGES_SHARE, BentHull, Say
-from reconstruct.hull.follow_normals import follow_normals, normals_bias
+from reconstruct.hull.follow_normals import follow_normals
 from reconstruct.hull.normal_integration import integrate_normals
 from reconstruct.hull.shadow_hull import GroundMaps, carved
 from reconstruct.initialization.height_field import HeightConfig, beside_nothing, fit_heights
@@ -70,10 +70,6 @@ class Start(Protocol):
 
     def labels(self, surface: SdfGrid, scenes: Scenes) -> tuple[Labels, ...]:
         """Return each view's labels for the solver, computed with the current surface."""
-        ...
-
-    def shaped(self, surface: SdfGrid, scenes: Scenes, labels: tuple[Labels, ...]) -> SdfGrid:
-        """Return the surface that a finer level begins with, corrected over long distances by the labels."""
         ...
 
     def better(self, start: SdfGrid, found: SdfGrid, scenes: Scenes) -> SdfGrid:
@@ -179,16 +175,6 @@ class HullStart:
         found = tuple(observer.labels(surface, s) for observer, s in zip(self._observers, scenes, strict=True))
         return (self._observers[0].with_normals(found[0], surface, scenes[0]),) if self.name == LIT_HULL else found
 
-    def shaped(self, surface: SdfGrid, scenes: Scenes, labels: tuple[Labels, ...]) -> SdfGrid:
-        """Return the surface moved to the integral of the labels' normals, where there are any.
-
-        Not with several views, see `bent_hull`: behind an edge that one of them looks past, a chest became 8 mm hollow.
-        """
-        if len(scenes) > 1:
-            return surface
-        scene, observer, own = next(zip(scenes, self._observers, labels, strict=True))
-        return follow_normals(surface, scene, *observer.seen(surface), own, integrate_normals, normals_bias(scene))
-
     def better(self, start: SdfGrid, found: SdfGrid, scenes: Scenes) -> SdfGrid:
         """Return the found surface: the hull is never better."""
         return found
@@ -260,10 +246,6 @@ class HeightStart:
         if self._judge is None:
             self._judge = (surface, scene, self._held_out(scene, labels))
         return (without(labels, self._drawn()),)
-
-    def shaped(self, surface: SdfGrid, scenes: Scenes, labels: tuple[Labels, ...]) -> SdfGrid:
-        """Return the surface unchanged: its depths were solved jointly."""
-        return surface
 
     def better(self, start: SdfGrid, found: SdfGrid, scenes: Scenes) -> SdfGrid:
         """Return the free surface, unless the height field explains the held-out rays better."""

@@ -238,8 +238,6 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, tup
     task.say(f"reading shadows and slopes from the photos for round {state.level + 1} of {len(config.levels)}")
     labels = begin.labels(state.start, lit_from(scenes, state.start_shift))
     start, rays = _resumed(state, scenes, labels, level)
-    if state.level == 1 and state.iteration == 0:  # later ones are nearer to the truth than any integral
-        start = resampled(begin.shaped(start.grid(), scenes, labels), level.nodes)
     rays, held_out = _held_out(scenes, rays, config)
     _leave_out(state.left_out, scenes, rays)
     surface = start.on(task.device)
