@@ -74,7 +74,7 @@ export function run(name, again) {
       one.state === "running" && h("p", { class: "quiet" }, "It goes on when this page or the studio is closed."),
       h("div", { class: "bar" },
         (one.state === "running" || one.state === "waiting") && one.job && h("button", { onclick: () => act(one, "stop") }, one.state === "running" ? "Stop and keep" : "Remove from the queue"),
-        one.state === "running" && h("button", { onclick: () => inspect(one) }, "Watch it grow in 3D"),
+        one.growing && h("button", { onclick: () => inspect(one) }, "Watch it grow in 3D"),
         one.state === "waiting" && h("button", { onclick: () => act(one, "first") }, "Next in line"),
         one.state === "failed" && photos && h("a", { class: "button main", href: photos }, "Look at its photos"),
         (one.state === "failed" || one.state === "stopped") && one.job && h("button", { class: one.state === "stopped" ? "main" : "", onclick: () => act(one, "again") }, "Go on where it stood")));
@@ -103,7 +103,7 @@ export function run(name, again) {
   });
   const inspect = (one) => attempt(async () => {
     const tab = window.open("", "_blank");
-    const address = await change("view", { key: one.key });
+    const address = await change("view", { key: one.key }).catch((error) => { tab?.close(); throw error; });
     if (tab) { tab.opener = null; tab.location = address; } else location.href = address;
   });
 
