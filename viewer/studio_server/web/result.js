@@ -87,7 +87,7 @@ export function run(name, again) {
         one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report")),
       facts(one),
       one.scale && h("p", { class: "quiet" }, one.scale),
-      one.verdict_sentence && h("p", {}, one.verdict_sentence),
+      one.verdict_sentence && h("p", { class: `verdict ${one.verdict}` }, one.verdict_sentence),
       one.warnings.length > 0 && h("details", { class: "panel" }, h("summary", { class: "warn" }, plural(one.warnings.length, "remark")),
         h("ul", { class: "plain" }, one.warnings.map((text) => h("li", {}, text)))),
       one.has_mesh && saver.panel());
@@ -127,7 +127,7 @@ function growing(name) {
 }
 
 const facts = (one) => h("ul", { class: "facts" }, [one.size, one.preset && presetWords(one.preset), `made in ${duration(one.progress.elapsed_s)}`,
-  one.guessed !== null && `${Math.round(100 * one.guessed)} % of the surface is a guess: no photo shows it`].filter(Boolean).map((text) => h("li", {}, text)));
+  one.guessed !== null && `${Math.round(100 * one.guessed)} % of the surface is a guess, which no photo shows and no shadow holds`].filter(Boolean).map((text) => h("li", {}, text)));
 
 const stageOf = (one) => `/stage/${one.key.split("/").map(key).join("/")}/`;
 
