@@ -98,6 +98,8 @@ def report_of(truth: Truth) -> dict:
         "stages": {name: cost for name in ("capture", "calibrate", "observe", "hull", "solve", "mesh")},
         "photos": photos,
         "fit": {"shadow_agreement": 0.987, "colour_rms": 0.021},
+        "grade": "fair",
+        "verdict": "Fair: the lights cover only half of the sky.",
         "warnings": ["The lights cover only half of the sky; the far side is a guess."],
         "assumptions": ["Millimetres: a square of the board was taken to be 30 mm."],
         "versions": {"shadowgraph": "0.1.0", "python": "3.11.2", "torch": "2.13.0"},

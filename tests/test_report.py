@@ -72,7 +72,7 @@ def whole_page(run) -> str:
 def test_the_report_of_a_whole_run_has_every_part(whole_page):
     read = Reader(whole_page)
     for words in (
-        "A mesh was made",
+        "Fair: the lights cover only half of the sky.",
         "112.0 \N{MULTIPLICATION SIGN} 82.0 \N{MULTIPLICATION SIGN} 70.0 mm",
         "closed",
         "What the camera sees",

@@ -42,7 +42,7 @@ def page_file(run):
 def test_the_page_is_one_small_file_that_asks_for_nothing(page_file):
     text = page_file.read_text()
     assert page_file.stat().st_size < 5e6
-    assert "default-src 'none'" in text
+    assert "default-src 'none'" in text and "Fair: the lights cover only half of the sky." in text
     assert "http://" not in text.replace("http://www.w3.org", "") and "https://" not in text
 
 

@@ -33,7 +33,8 @@ def run_in(folder: Path, name: str, is_finished: bool = True, message: str = "")
     if is_finished:
         fake_run.log_line(run, 60.0, "done", 1, 1, "mesh.ply written")
         mesh = {"size": [93.0, 113.4, 120.3], "evidence": {"unconstrained": {"share": 0.33}}}
-        write_json(run / "report.json", {"unit": "mm", "mesh": mesh, "warnings": ["a remark"]})
+        said = {"grade": "fair", "verdict": "Fair: a remark.", "warnings": ["a remark"]}
+        write_json(run / "report.json", {"unit": "mm", "mesh": mesh, **said})
         write_json(run / "check.json", {"verdict": "good", "sentence": "Good: 6 of 6 photos usable."})
     elif message:
         fake_run.log_line(run, 9.0, "solve", 0, 0, message)
@@ -59,8 +60,9 @@ def test_captures_and_their_runs_are_cards_with_what_is_known_of_them(folder):
     runs = {run["key"]: run for run in cards["vase"]["runs"]}
     assert runs.keys() == {"runs/vase", "runs/vase-fine"}
     run, stopped = runs["runs/vase"], runs["runs/vase-fine"]
-    known = [run[name] for name in ("state", "size", "preset", "verdict")]
-    assert known == ["finished", "93.0 \N{MULTIPLICATION SIGN} 113.4 \N{MULTIPLICATION SIGN} 120.3 mm", "draft", "good"]
+    known = [run[name] for name in ("state", "size", "preset", "verdict", "verdict_sentence")]
+    size = "93.0 \N{MULTIPLICATION SIGN} 113.4 \N{MULTIPLICATION SIGN} 120.3 mm"
+    assert known == ["finished", size, "draft", "fair", "Fair: a remark."], "the run's verdict, not that of its photos"
     assert run["guessed"] == 0.33 and run["warnings"] == ["a remark"]
     assert stopped["state"] == "stopped" and "Stopped while" in stopped["sentence"]
     assert cards["captures/cup"]["count"] == 6 and state["free"] > 0

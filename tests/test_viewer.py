@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import fake_run
@@ -137,14 +138,30 @@ def test_the_page_follows_a_run_from_nothing_to_the_way_to_its_stage(tmp_path, t
     assert not page.is_over and page._lamp is None
     fake_run.start_run(tmp_path, truth)
     page.refresh()
-    assert "Fitting the surface" in page.controls._status.content and "/stage/" not in page.controls._status.content
+    before = page.controls._status.content
+    assert "Fitting the surface" in before and "/stage/" not in before
     np.testing.assert_allclose(page._lamp.handle.position, light_position(page._lights[0].light, page._scale))
+    written = (tmp_path / "log.jsonl").stat().st_mtime
+    os.utime(tmp_path / "log.jsonl", (written, written - 100))
+    page.refresh()
+    assert page.controls._status.content != before, "its clock stands still between two lines of the log"
     fake_run.finish_run(tmp_path, truth)
     page.refresh()
     assert page.is_over and "/stage/" in page.controls._status.content and " mm" in page.controls._status.content
     page.choose_photo(4)
     np.testing.assert_allclose(page._lamp.handle.position, light_position(page._lights[4].light, page._scale))
     assert truth.calibration.lights[4].photo in page.controls._caption.content
+
+
+def test_photos_can_be_looked_through_before_camera_and_lights_are_found(tmp_path, truth, server):
+    fake_run.start_run(tmp_path, truth)
+    (tmp_path / "calibration.json").unlink()
+    page = Page(tmp_path, server)
+    page.refresh()
+    names = page.follower.thumbnails()
+    assert names[-1] in page.controls._caption.content
+    page.choose_photo(0)
+    assert names[0] in page.controls._caption.content
 
 
 def test_a_damaged_file_does_not_end_the_page(tmp_path, truth, server):

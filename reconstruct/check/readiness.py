@@ -56,6 +56,8 @@ class Readiness:
 
 def in_one_sentence(grade: str, reasons: Sequence[str]) -> str:
     """Return a verdict in one sentence: its grade, the first of its reasons, and how many more there are."""
+    if not reasons:
+        return f"{grade.capitalize()}: no check found fault with it."
     further = len(reasons) - 1
     more = f", and for {further} more reason{'s' * (further > 1)}" if further else ""
     return f"{grade.capitalize()}: {reasons[0].rstrip('.')}{more}."

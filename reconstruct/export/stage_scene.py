@@ -275,4 +275,4 @@ class FirstView:
         outside = (*decode_srgb(self._scene.ground_mean).tolist(), 0.0)
         return torch.from_numpy(
             cv2.remap(self._fields.albedo.numpy(), x, y, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, outside)
-        )
+        ).clamp(max=1)  # as in the pictures that the page draws with

@@ -77,7 +77,7 @@ def summary(
         "calibration": residuals,
         **_of_views(calibrated, solved),
         "assumptions": plain(notes),
-        "verdict": in_one_sentence(grade, warnings) if warnings else "",
+        "verdict": in_one_sentence(grade, warnings),
         "grade": grade,
         "warnings": warnings,
         "fit": fit,

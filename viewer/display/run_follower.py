@@ -1,6 +1,7 @@
 """RunFollower: what a run folder holds at any moment. Only what has changed is read again."""
 
 import os
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -108,6 +109,11 @@ class RunFollower:
         """Return whether a living process holds this run."""
         return (self.path / LOCK).exists() and not is_abandoned(self.path / LOCK)
 
+    def since_last_line_s(self) -> float:
+        """Return the seconds since the log was written to, or, before it is there, since the run took the folder."""
+        mark = self._mark(LOG) or self._mark(LOCK)
+        return max(0.0, time.time() - mark[0] / 1e9) if mark else 0.0
+
     def mesh_name(self, lines: Sequence[Mapping[str, Any]]) -> str | None:
         """Return which mesh to show after these lines of the log: the growing one until the final one is written.
 
@@ -153,14 +159,15 @@ def status(lines: list[dict[str, Any]], is_running: bool, since_last_line_s: flo
     last, forecast = lines[-1], Forecast(lines)
     stage = forecast.stage
     name = STAGE_NAMES.get(stage, stage.capitalize() or "Working")
-    elapsed = float(last.get("t") or 0.0) + (since_last_line_s if is_running else 0.0)
     message = str(last.get("message") or "")
+    is_working = is_running and not message.startswith(PAUSED)
+    elapsed = float(last.get("t") or 0.0) + (since_last_line_s if is_working else 0.0)
     if stage == "done":
         return Status(name, message, 1.0, elapsed_s=elapsed, is_over=True, is_finished=True)
     done, total = float(last.get("done") or 0), float(last.get("total") or 0)
     if not is_running:
         return Status(f"Stopped while {name[0].lower()}{name[1:]}", message, elapsed_s=elapsed, is_over=True)
-    if message.startswith(PAUSED):
+    if not is_working:
         name, message = f"Paused while {name[0].lower()}{name[1:]}", ""
     counts = f"{done:g} of {total:g}" if total > 1 else ""
     forecast.at(elapsed)

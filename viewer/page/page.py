@@ -102,7 +102,7 @@ class Page:
         """Read the folder once and show what is new."""
         with self._lock:
             lines = self.follower.log()
-            now = status(lines, self.follower.is_running())
+            now = status(lines, self.follower.is_running(), self.follower.since_last_line_s())
             self.is_over, is_due = now.is_over, now.is_over or self._is_due()
             try:
                 self._read_results(lines, is_due)
@@ -111,7 +111,7 @@ class Page:
             if self._awaits_thumbnail:
                 self._show_photo(self.controls.photo_index())
             elif self._calibration is None and self.follower.changed(THUMBS):
-                self._show_newest_photo()
+                self._show_read_photo()
             has_result = now.is_over and self._mesh_name == MESH and self.follower.has_result(lines)
             self.controls.follow(now, lines, self.problem or self._size, has_result)
             if is_due and self.follower.changed(LOG):
@@ -197,7 +197,9 @@ class Page:
 
     def _show_photo(self, index: int) -> None:
         """Show this photo in the camera's frustum and among the controls, and mark its light."""
-        if not self._cameras or index >= len(self._lights):
+        if self._calibration is None:
+            self._show_read_photo(index)
+        if index >= len(self._lights):
             return
         light = self._lights[index].light
         picture = self.follower.thumbnail(light.photo)
@@ -209,11 +211,12 @@ class Page:
             words = light.photo if light.used else f"{light.photo}, not used: {light.reason}"
             self.controls.show_photo(index, len(self._lights), words, picture)
 
-    def _show_newest_photo(self) -> None:
-        """Show how many photos have been read so far, and the last of them."""
+    def _show_read_photo(self, index: int = -1) -> None:
+        """Show how many photos have been read so far, and one of them: the newest unless told."""
         names = self.follower.thumbnails()
         if names:
-            self.controls.show_photo(len(names) - 1, len(names), names[-1], self.follower.thumbnail(names[-1]))
+            index %= len(names)
+            self.controls.show_photo(index, len(names), names[index], self.follower.thumbnail(names[index]))
 
     def _show_layers(self) -> None:
         """Show and hide the layers according to their switches."""

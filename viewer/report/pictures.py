@@ -201,7 +201,8 @@ def photos_part(
     unseen = [f"{name}: not used, {why}" for name, _, why in dropped if Path(thumbnail_name(name)).stem not in thumbs]
     return doc.section(
         "Photos",
-        f"{sum(lit)} of {len(lit)} photos of the object were used; grey ones were left out, for the reason given.",
+        f"{sum(lit)} of {len(lit)} photos of the object were used"
+        + ("; grey ones were left out, for the reason given." if dropped else "."),
         (f'<div class="grid">{shown}</div>' if shown else "") + doc.bullets(unseen) if rows else "",
     )
 

@@ -17,7 +17,6 @@ import trimesh
 from calibration.calibration import Calibration, load_calibration
 from capture.errors import UserError
 from capture.files.atomic import atomic_file
-from reconstruct.check.readiness import GRADES
 from reconstruct.fields import SolvedScene
 from reconstruct.source.source import RunOptions
 from reconstruct.stored_run.documents import MANIFEST, REPORT
@@ -26,11 +25,11 @@ from reconstruct.stored_run.ply import read_mesh
 from reconstruct.stored_run.stored_run import CALIBRATION, FIELDS, MESH, StoredRun
 from viewer.display.run_follower import RunFollower, status
 from viewer.report import document as doc
+from viewer.report.check_page import KINDS
 from viewer.report.numbers import calibration_part, cost_part, curves_part, findings, lights_part, refinement_part
 from viewer.report.pictures import (
     comparison_part,
     guess_facts,
-    guessed_share,
     maps_part,
     mesh_pictures,
     photos_part,
@@ -143,19 +142,13 @@ def _verdict(results: Results) -> tuple[str, str]:
     if results.mesh is None:
         return f"There is no mesh. {status(results.log, is_running=False).title}.", "bad"
     warnings = len(_warnings(results))
-    if report.get("verdict"):
-        return str(report["verdict"]), "bad" if report.get("grade") in GRADES[2:] else "warn"
+    kind = KINDS.get(str(report.get("grade")), "warn")
+    if report.get("verdict") and (kind or not warnings):
+        return str(report["verdict"]), kind
     if warnings:
         remarks = "remark" if warnings == 1 else f"{warnings} remarks"
         return f"A mesh was made. Read the {remarks} below before you rely on it.", "warn"
-    guessed = guessed_share(report)
-    if guessed is None:
-        return "A closed mesh was made, and none of the checks below found fault with it.", ""
-    return (
-        f"A closed mesh was made; {guessed:.0%} of it is a guess, which neither the photos nor their shadows hold. "
-        "None of the checks below found fault with the rest.",
-        "",
-    )
+    return "A closed mesh was made, and none of the checks below found fault with it.", ""
 
 
 def _warnings(results: Results) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from capture.errors import ReconstructionError
+from capture.errors import ReconstructionError, UserError
 from capture.files.atomic import atomic_file
 from capture.files.title import title_of
 from reconstruct.export.export import FORMATS, UNIT_WORDS, Contents, ExportOptions, Format, OnProgress
@@ -117,7 +117,16 @@ def page_of(run_dir: Path, pack: StagePack, saves: str = "", home: str = "") -> 
     Raises:
         UserError: the document cannot be used.
     """
-    return page_html(title_of(run_dir), pack, read_stage_document(run_dir), saves, home)
+    return page_html(title_of(run_dir), pack, read_stage_document(run_dir), saves, home, _fault(run_dir))
+
+
+def _fault(run_dir: Path) -> str:
+    """Return the verdict on the result as the report says it; "" where it is good or there is none."""
+    try:
+        report = StoredRun(run_dir).report
+    except UserError:  # a run without a report can be looked at, too
+        return ""
+    return "" if report.get("grade") == "good" else str(report.get("verdict") or "")
 
 
 def page_html(
@@ -126,6 +135,7 @@ def page_html(
     document: dict[str, Any] | None = None,
     saves: str = "",
     home: str = "",
+    fault: str = "",
 ) -> str:
     """Return the page's HTML.
 
@@ -134,12 +144,14 @@ def page_html(
         saves: how its document can be kept with the run: "socket" (WebSocket stage.json of its server, which also makes
             other kinds of files), "frame" (a message to the page around it, as this one has no origin); "": it cannot.
         home: address of the page that led here, for a link back; "": none.
+        fault: the verdict on a result that is not good; in a "frame" the page around it says it.
     """
     is_served = saves == "socket"
     facts = addressed(pack.facts, {part: as_address(pack.read(part), kind_of(part)) for part in pack.names})
     values = {
         "title": html.escape(name),
         "size": html.escape(str(facts["size"])),
+        "fault": html.escape(fault) if saves != "frame" else "",
         "policy": page_policy("'self'" if is_served else "'none'"),
         "style": _asset("stage.css"),
         "first": html.escape(facts["addresses"]["first"]),

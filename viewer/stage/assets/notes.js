@@ -13,7 +13,7 @@ const digits = () => (facts.unit === "mm" ? 1 : 3);
 
 export function startTool(kind) {
   Object.assign(tool, { kind, first: null, cross: onScreen([0, 0, 0], innerWidth, innerHeight).slice(0, 2) });  // on the object's middle
-  const touch = "Tap the surface, or move the cross with the arrow keys and press Enter. Escape ends it.";
+  const touch = "Tap the surface, or move the cross with the arrow keys and press Enter. Escape, or the same button again, ends it.";
   say(kind === "length" ? `First end. ${touch}` : touch);
   showCross();
 }

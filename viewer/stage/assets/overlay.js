@@ -1,10 +1,11 @@
 // What lies over the picture: lines in space (grid, camera, lights), the scale bar, and markers of notes.
-import { add, norm } from "./vectors.js";
+import { add, clamp, norm } from "./vectors.js";
 import { byId, cameraOf, facts, groundPlace, toPage } from "./scene.js";
 import { cameraNow, onScreen, shown, stage, view } from "./state.js";
 import { isHidden } from "./pick.js";
 
 const GREY = [0.75, 0.78, 0.85, 0.35], STRONG = [0.75, 0.78, 0.85, 0.6], AMBER = [0.98, 0.7, 0.25, 0.9], PALE = [0.7, 0.72, 0.78, 0.5], CHOSEN = [1, 0.36, 0.22, 1];
+const MOST_LETTERS = 36, LETTER_PX = 8; // of a note's text in the picture; the panel lists all of it
 const BAR = 0.2;                     // of the window's width, about
 const ns = "http://www.w3.org/2000/svg";
 
@@ -115,10 +116,11 @@ function stroke(d, kind) {
 }
 
 function label([x, y], dy, text, way) {
-  const words = document.createElementNS(ns, "text");
-  words.setAttribute("x", x);
+  const words = document.createElementNS(ns, "text"), said = text.length > MOST_LETTERS ? `${text.slice(0, MOST_LETTERS)}\u2026` : text;
+  const width = LETTER_PX * said.length, before = way > 8 ? 0 : way < -8 ? width : width / 2;
+  words.setAttribute("x", clamp(x, before, Math.max(before, innerWidth - width + before)));
   words.setAttribute("y", y + dy);
   words.setAttribute("text-anchor", way > 8 ? "start" : way < -8 ? "end" : "middle");
-  words.textContent = text;
+  words.textContent = said;
   return words;
 }

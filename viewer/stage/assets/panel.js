@@ -3,7 +3,7 @@ import { byId, facts, served } from "./scene.js";
 import {
   canRedo, canUndo, editStage, lamp, lampFromAbove, lampTo, putLamp, redo, savedSentence, setLamp, setShown, setView, shown, stage, undo,
 } from "./state.js";
-import { recallView, removeNote, removeView, saveFile, savePicture, saveView, sharePage, startTool } from "./notes.js";
+import { endTool, recallView, removeNote, removeView, saveFile, savePicture, saveView, sharePage, startTool, tool } from "./notes.js";
 import { showPhoto } from "./renderer.js";
 
 const RAKING = 8 * Math.PI / 180;
@@ -14,7 +14,7 @@ const unit_ = facts.unit === "mm" ? "mm" : "units";
 const on = (id, event, act) => byId(id).addEventListener(event, act);
 const KEYS = [
   ["Arrows", "move the lamp"], ["Shift and arrows", "turn the view"], ["Ctrl and arrows", "shift the picture"], ["+ and -", "zoom"],
-  ["Home or 0", "back to the first view and lamp"], ["L", "the light follows the mouse, or stays"], ["1 to 8", "what is shown: 6 is what is known"],
+  ["Home or 0", "back to the first view and lamp"], ["L", "the light follows the pointer, or stays"], ["1 to 8", "what is shown: 6 is what is known"],
   ["Ctrl Z, Ctrl Shift Z", "undo, redo"], ["Enter, Escape", "place a note at the cross, end it"], ["?", "this list"],
 ];
 const ABOUT = [
@@ -23,7 +23,7 @@ const ABOUT = [
   "\u201cWhat is known\u201d colours the surface: what was seen in the photos is light and plain, what shadows alone hold is striped, a guess is dark and crossed. The ground outside the photo is its mean colour.",
   "Light falls off with the square of the distance. Some comes from an overcast sky, as much as object and ground leave of it, and some bounces once. Raking light, specular enhancement and unsharp masking are those of reflectance transformation imaging. Curvature shows ridges light and grooves dark. Surroundings are a room that was made up.",
   "Crop box, smoothing and cutting the guess away are written into meshes that are exported from now on; the run's own mesh stays as it was, so that all can be undone. Here smoothing changes the shading alone.",
-  "A length's \u00b1 is the error of pointing at both ends, one standard deviation; the surface's own error comes on top and is stated in the report.",
+  "A length's \u00b1 is the error of pointing at both ends, one standard deviation; the surface's own error comes on top, and mesh.ply holds it for each vertex.",
 ];
 
 export function usePanel(redraw) {
@@ -131,7 +131,7 @@ function documentControls() {
 
 function startToolFrom(kind) {
   if (isNarrow()) openPanel(false);
-  startTool(kind);
+  if (tool.kind === kind) endTool(); else startTool(kind);
   byId("picture").focus();
 }
 

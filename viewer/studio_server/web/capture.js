@@ -142,15 +142,15 @@ export function capture(name, again) {
   }
 
   function startPanel(row) {
-    const time = Object.fromEntries(times.map((one) => [one.name, one]));
+    const time = Object.fromEntries(times.map((one) => [one.name, one])), isEmpty = row.photos.length + row.clips.length === 0;
     return h("section", { class: "panel" }, h("h2", {}, "Reconstruct"),
       h("fieldset", { class: "choice", "aria-label": "How fine" }, Object.entries(PRESETS).map(([value, [title, words]]) => h("label", { key: value },
         h("input", { type: "radio", name: "preset", value, checked: value === preset, onchange: () => { preset = value; again(); } }),
         h("b", {}, title), h("div", { class: "small quiet" }, words, " ",
-          time[value] ? `Takes ${about(time[value].seconds)} here, and ${bytes(time[value].bytes)} of memory${time[value].fits ? "" : ": more than is free"}.` : "Measuring this machine.")))),
-      h("button", { class: "main", disabled: row.photos.length + row.clips.length === 0 || sender.open.length > 0 || row.coming > 0, onclick: () => start(row) }, row.clips.length ? "Start" : row.counts.start),
+          time[value] ? `Takes ${about(time[value].seconds)} here, and ${bytes(time[value].bytes)} of memory${time[value].fits ? "" : ": more than is free"}.` : !isEmpty && "Measuring this machine.")))),
+      h("button", { class: "main", disabled: isEmpty || sender.open.length > 0 || row.coming > 0, onclick: () => start(row) }, row.clips.length ? "Start" : row.counts.start),
       row.counts.uses && !row.clips.length && h("p", { class: "quiet small" }, row.counts.uses),
-      row.photos.length + row.clips.length === 0 ? h("p", { class: "quiet small" }, "Photos first.")
+      isEmpty ? h("p", { class: "quiet small" }, "Photos first.")
         : (sender.open.length > 0 || row.coming > 0) && h("p", { class: "quiet small" }, "Starts once all photos are here."),
       row.check.verdict === "hopeless" && h("p", { class: "warn small" }, "These photos will not do, as the verdict says: a run would stop there."));
   }

@@ -69,13 +69,14 @@ export function home(_, again) {
         : h("div", { class: "picture empty" }, card.kind === "capture" ? "No photos yet" : "No picture yet");
     const state = run && ["waiting", "running", "failed"].includes(run.state) && card.state !== "arriving" ? run.state
       : ["checked", "new"].includes(card.state) && shown ? "finished" : card.state || (run && run.state);
+    const judged = state === "finished" && shown ? shown : card;
     return h("li", { class: "card", key: card.key },
       h("a", { class: "face", href: shown ? `#/run/${key(shown.key)}` : href, "aria-hidden": "true", tabindex: "-1" }, face),
       h("div", { class: "body" },
         h("h2", {}, h("a", { href }, card.title)),
         h("p", {}, h("span", { class: `tag ${state === "failed" ? "bad" : ""}` }, WORDS[state] || state), " ",
-          card.verdict && h("span", { class: `tag ${card.verdict}` }, card.verdict)),
-        words(card, run, state),
+          judged.verdict && h("span", { class: `tag ${judged.verdict}` }, judged.verdict)),
+        words(card, run, state, judged),
         h("p", { class: "small quiet" }, [card.count ? plural(card.count, "photo") : null, shown && shown.size,
           (shown || run) && presetWords((shown || run).preset), day(card.date)].filter(Boolean).join(" · "))),
       h("div", { class: "foot" },
@@ -86,7 +87,7 @@ export function home(_, again) {
         h("button", { class: "danger", "aria-label": `Delete ${card.title}`, onclick: () => remove(card) }, "Delete")));
   }
 
-  function words(card, run, state) {
+  function words(card, run, state, judged) {
     if (state === "arriving" && card.coming) {
       return h("p", { class: "small" }, `${plural(card.coming, "file")} on the way, ${bytes(card.here_bytes)} of ${bytes(card.coming_bytes)} here`,
         card.stalled > 0 && h("span", { class: "warn" }, "; stopped in the middle: the sender has left"));
@@ -100,7 +101,7 @@ export function home(_, again) {
     }
     if (state === "failed") return h("p", { class: "small bad" }, run.sentence);
     if (state === "waiting") return h("p", { class: "small" }, run.sentence);
-    return card.verdict_sentence ? h("p", { class: "small" }, card.verdict_sentence) : null;
+    return judged.verdict_sentence ? h("p", { class: "small" }, judged.verdict_sentence) : null;
   }
 
   function mark(name) {

@@ -74,7 +74,7 @@ export function run(name, again) {
       one.state === "running" && h("p", { class: "quiet" }, "It goes on when this page or the studio is closed."),
       h("div", { class: "bar" },
         (one.state === "running" || one.state === "waiting") && one.job && h("button", { onclick: () => act(one, "stop") }, one.state === "running" ? "Stop and keep" : "Remove from the queue"),
-        one.state === "running" && h("button", { onclick: () => inspect(one) }, "Watch it grow in 3D"),
+        one.growing && h("button", { onclick: () => inspect(one) }, "Watch it grow in 3D"),
         one.state === "waiting" && h("button", { onclick: () => act(one, "first") }, "Next in line"),
         one.state === "failed" && photos && h("a", { class: "button main", href: photos }, "Look at its photos"),
         (one.state === "failed" || one.state === "stopped") && one.job && h("button", { class: one.state === "stopped" ? "main" : "", onclick: () => act(one, "again") }, "Go on where it stood")));
@@ -87,7 +87,7 @@ export function run(name, again) {
         one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report")),
       facts(one),
       one.scale && h("p", { class: "quiet" }, one.scale),
-      one.verdict_sentence && h("p", {}, one.verdict_sentence),
+      one.verdict_sentence && h("p", { class: `verdict ${one.verdict}` }, one.verdict_sentence),
       one.warnings.length > 0 && h("details", { class: "panel" }, h("summary", { class: "warn" }, plural(one.warnings.length, "remark")),
         h("ul", { class: "plain" }, one.warnings.map((text) => h("li", {}, text)))),
       one.has_mesh && saver.panel());
@@ -103,7 +103,7 @@ export function run(name, again) {
   });
   const inspect = (one) => attempt(async () => {
     const tab = window.open("", "_blank");
-    const address = await change("view", { key: one.key });
+    const address = await change("view", { key: one.key }).catch((error) => { tab?.close(); throw error; });
     if (tab) { tab.opener = null; tab.location = address; } else location.href = address;
   });
 
@@ -127,7 +127,7 @@ function growing(name) {
 }
 
 const facts = (one) => h("ul", { class: "facts" }, [one.size, one.preset && presetWords(one.preset), `made in ${duration(one.progress.elapsed_s)}`,
-  one.guessed !== null && `${Math.round(100 * one.guessed)} % of the surface is a guess: no photo shows it`].filter(Boolean).map((text) => h("li", {}, text)));
+  one.guessed !== null && `${Math.round(100 * one.guessed)} % of the surface is a guess, which no photo shows and no shadow holds`].filter(Boolean).map((text) => h("li", {}, text)));
 
 const stageOf = (one) => `/stage/${one.key.split("/").map(key).join("/")}/`;
 
