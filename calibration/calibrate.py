@@ -20,6 +20,7 @@ from calibration.flashlight.phone import MIN_VIEWS, PhoneViews, locate_lights_fr
 from calibration.flashlight.solids import fuse_shadow_lights, locate_sun
 from calibration.light import Light
 from calibration.lights.mixed_light import SECOND_LIGHT, MixedLight, mixture_of
+from calibration.lights.power import on_albedo_scale
 from calibration.outlines.metric_cues import MetricCues
 from calibration.posed_camera import PosedCamera
 from calibration.reframed import reframed, with_doubt
@@ -92,7 +93,7 @@ def calibrate(
     rows |= {"notes": notes, "warnings": [*residuals.get("warnings", []), *mixtures]}
     residuals = residuals | fit.residuals | wider | rows
     shared = {"beam": fit.beam, "ambient": fit.ambient, "residuals": residuals, "side_views": cues.views}
-    return Calibration.of(posed_camera, every, **shared)
+    return on_albedo_scale(Calibration.of(posed_camera, every, **shared), stack)
 
 
 def with_camera_error(

@@ -17,7 +17,7 @@ from calibration.lights.files import GivenLights, read_lights, read_opinions
 from calibration.lights.fusion import disagree, fuse
 from calibration.lights.known_ground import LONG_SIDE
 from calibration.lights.photo_lists import bare
-from calibration.lights.power import with_common_power, with_power_per_photo
+from calibration.lights.power import on_albedo_scale, with_common_power, with_power_per_photo
 from calibration.posed_camera import PosedCamera
 from calibration.reframed import reframed
 from calibration.side_photos.side_views import metric_cues, side_notes
@@ -75,7 +75,8 @@ def calibrate_with_file(
     rows = {"side_photos": [side.row() for side in sides], "left_out_photos": [one.row() for one in session.left_out]}
     residuals = residuals | {"notes": notes} | rows
     shared = {"beam": given.beam, "ambient": ambient, "residuals": residuals, "side_views": cues.views}
-    return Calibration.of(posed_camera, lights, **shared)
+    found = Calibration.of(posed_camera, lights, **shared)
+    return found if given.has_power else on_albedo_scale(found, stack)
 
 
 def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> Calibration:

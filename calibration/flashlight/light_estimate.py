@@ -25,7 +25,7 @@ from calibration.flashlight.fit import (
     with_oval_beams,
     without_gloss,
 )
-from calibration.flashlight.model import Flashlights, Priors, cosines, free_tangent, log_irradiance
+from calibration.flashlight.model import Flashlights, Priors, cosines, free_tangent
 from calibration.flashlight.outline_lights import OUTLINE_SIDE, outline_sigma, with_outlines
 from calibration.flashlight.pictured import as_pictured, with_response
 from calibration.flashlight.uncertainty import position_sigma, unseen_error
@@ -33,7 +33,6 @@ from calibration.flashlight.wall import WALL_TERMS
 from calibration.light import Light, Vector
 from calibration.lights import hand
 from calibration.lights.ground_cells import ground_ends
-from calibration.lights.power import albedo_scale
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
 from calibration.outlines.terms import DROP_OUTLINE
 from calibration.posed_camera import PosedCamera
@@ -82,9 +81,8 @@ def describe(
 ) -> LightFit:
     """Return the lights of a fit.
 
-    Powers and beam are those by which the pictures show the ground, bent as they are. Albedo has no absolute scale: the
-    brightest 1 % of the ground is set to 0.9 in its brightest channel. The flashlight is taken as white over the
-    session; a colour difference of one photo is a difference of its power.
+    Powers and beam are those by which the pictures show the ground, bent as they are, on any common scale. The
+    flashlight is taken as white over the session; a colour difference of one photo is a difference of its power.
 
     Args:
         floor: position error that no residual shows, in all three coordinates together.
@@ -119,20 +117,16 @@ def _colour(fit: FlashlightFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:
     """Power per photo and channel, and ambient irradiance: the grey fit repeated per channel with fixed geometry."""
     cells = fit.evidence.cells
     held = _powers_only(fit.flashlights)
-    powers, ambients, albedos = [], [], []
+    powers, ambients = [], []
     for channel in range(3):
         evidence = replace(fit.evidence, log_grey=np.log(np.maximum(cells.rgb[..., channel], 1e-9)))
-        flashlights, weight = refine(fit.flashlights, evidence, Priors(log_power=0.1), lambda _: held, COLOUR_STEPS)
+        flashlights = refine(fit.flashlights, evidence, Priors(log_power=0.1), lambda _: held, COLOUR_STEPS)[0]
         shift = np.mean(
             flashlights.log_power - fit.flashlights.log_power
         )  # into albedo: the session's flashlight is white
-        raw = evidence.log_grey - log_irradiance(flashlights, evidence) + shift
-        total = weight.sum(0)
-        albedos.append(np.exp((weight * raw).sum(0)[total > 0] / total[total > 0]))
         powers.append(np.exp(flashlights.log_power - shift))
         ambients.append(flashlights.ambient * np.exp(-shift))
-    scale = albedo_scale(albedos)
-    return np.stack(powers, -1) * scale * hand.USUAL**2, np.array(ambients) * scale
+    return np.stack(powers, -1) * hand.USUAL**2, np.array(ambients)
 
 
 def _powers_only(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:

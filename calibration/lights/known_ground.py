@@ -38,7 +38,8 @@ def albedo_by_photo(
 ) -> tuple[Float[np.ndarray, "photos pixels"], Float[np.ndarray, "photos pixels"]]:
     """Return brightness over irradiance where rays meet the ground: on level ground, and on a surface facing the light.
 
-    nan where clipped. Only pixels that see ground under some light are used. The photos must be linear.
+    nan where clipped. Only pixels that see ground under some light are used, and photos that have a light. The photos
+    must be linear.
     """
     posed_camera = calibration.posed_camera.resized(stack.rgb.shape[2], stack.rgb.shape[1])
     rays = posed_camera.rays(posed_camera.camera.pixel_grid().reshape(-1, 2))
@@ -51,6 +52,8 @@ def albedo_by_photo(
     ground, facing = [], []
     for path, rgb, clipped in zip(stack.paths, stack.rgb, stack.clipped, strict=True):
         lights = [light for light in calibration.lights if light.photo == path.name]
+        if not lights:
+            continue
         to_facing, to_ground = (_grey_irradiance(lights, points, n, calibration.beam) for n in (None, up))
         usable = ~clipped.reshape(-1)[meets] & (to_ground > 0)
         value = mean_of_channels(rgb).reshape(-1)[meets]

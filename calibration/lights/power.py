@@ -12,13 +12,14 @@ from calibration.lights.ground_cells import GroundCells, sample_ground
 from calibration.lights.known_ground import (
     GROUND_LIT_QUANTILE,
     GROUND_SPREAD,
+    LONG_SIDE,
     albedo_by_photo,
     spread_between_photos,
 )
 from calibration.posed_camera import PosedCamera
 from capture.checks.robust import column_quantile
 from capture.errors import CalibrationError
-from capture.photos.photo import PhotoStack
+from capture.photos.photo import PhotoStack, reduced
 
 LIT_QUANTILE = 0.6  # over photos: of a cell's brightness over its irradiance, above shadows and below highlights
 ROUNDS = 4  # of albedo and power in turn: medians settle at once
@@ -44,20 +45,37 @@ class PoweredLights:
         )
 
 
-def albedo_scale(albedos: Sequence[Float[np.ndarray, "..."]]) -> float:
-    """The factor that divides albedo and multiplies power so that the brightest 1 % of the surface has albedo 0.9.
+def on_albedo_scale(calibration: Calibration, stack: PhotoStack) -> Calibration:
+    """Return the calibration with powers and ambient light on the albedo scale of CONVENTIONS.md.
 
-    Only the product of albedo and power is observed, so one of them is a choice, stated in CONVENTIONS.md and made only
-    here.
+    The lights that are used tell it; without any the calibration stays as it is.
 
-    Args:
-        albedos: one array per colour, on any common scale; nan where unknown. The brightest colour counts.
+    Raises:
+        CalibrationError: as with_common_power.
     """
-    return max(float(np.nanpercentile(albedo, BRIGHT_SHARE)) for albedo in albedos) / BRIGHTEST_ALBEDO
+    used = tuple(light for light in calibration.lights if light.used)
+    if not used:
+        return calibration
+    scale = _power_scale(replace(calibration, lights=used), reduced(stack, LONG_SIDE))
+    lights = tuple(replace(light, power=scale * light.power) for light in calibration.lights)
+    return replace(calibration, lights=lights, ambient=scale * calibration.ambient)
 
 
 def with_common_power(calibration: Calibration, stack: PhotoStack) -> Calibration:
     """Return the calibration with powers in the given proportions, on the albedo scale of CONVENTIONS.md.
+
+    Raises:
+        CalibrationError: no pixel sees the ground under any light.
+    """
+    scale = _power_scale(calibration, stack)
+    return replace(calibration, lights=tuple(replace(light, power=scale * light.power) for light in calibration.lights))
+
+
+def _power_scale(calibration: Calibration, stack: PhotoStack) -> float:
+    """Return the factor that multiplies power so that the brightest 1 % of ground and object has albedo 0.9.
+
+    Only the product of albedo and power is observed, so one of them is a choice, stated in CONVENTIONS.md and made only
+    here. An object's pixel has the albedo of a surface that faces its lights, in the upper quarter of the photos.
 
     Raises:
         CalibrationError: no pixel sees the ground under any light.
@@ -73,14 +91,13 @@ def with_common_power(calibration: Calibration, stack: PhotoStack) -> Calibratio
         column_quantile(ground, GROUND_LIT_QUANTILE),
         column_quantile(facing, FACING_QUANTILE),
     )
-    scale = max(albedo_scale([albedo]), 1e-12)
-    return replace(calibration, lights=tuple(replace(light, power=scale * light.power) for light in calibration.lights))
+    return max(float(np.nanpercentile(albedo, BRIGHT_SHARE)) / BRIGHTEST_ALBEDO, 1e-12)
 
 
 def with_power_per_photo(
     lights: Sequence[Light], stack: PhotoStack, posed_camera: PosedCamera, usable: Bool[np.ndarray, " photos"]
 ) -> PoweredLights:
-    """Return the lights with power per photo and colour, scaled so that the brightest 1 % of the ground has albedo 0.9.
+    """Return the lights with power per photo and colour, on any common scale.
 
     pixel = albedo(cell) power(photo) E(photo, cell), E the irradiance of power 1 on level ground; several lights of one
     photo share its power. Fitted in logarithms by alternating medians over cells and quantiles over photos, which
@@ -96,17 +113,15 @@ def with_power_per_photo(
     cells = sample_ground(stack, posed_camera, photos)
     names = [stack.paths[k].name for k in photos]
     unit = np.stack([_unit_irradiance([x for x in lights if x.photo == name], cells) for name in names])
-    powers, misfits, albedos = [], [], []
+    powers, misfits = [], []
     for channel in range(3):
         bright = np.maximum(cells.rgb[..., channel], 1e-9)
         ratio = np.where(cells.usable & (unit > 0), np.log(bright / np.maximum(unit, 1e-12)), np.nan)
-        power, albedo, misfit = _split(ratio)
+        power, misfit = _split(ratio)
         powers.append(power)
-        albedos.append(albedo)
         misfits.append(misfit)
     common = [float(np.mean(power)) for power in powers]  # the session's light is white: its colour goes to the albedo
-    scale = albedo_scale([np.exp(a + c) for a, c in zip(albedos, common, strict=True)])
-    power = scale * np.exp(np.stack([p - c for p, c in zip(powers, common, strict=True)], -1))
+    power = np.exp(np.stack([p - c for p, c in zip(powers, common, strict=True)], -1))
     by_name = dict(zip(names, power, strict=True))
     dark = np.zeros(3)
     return PoweredLights(
@@ -121,7 +136,7 @@ def _unit_irradiance(lights: Sequence[Light], cells: GroundCells) -> Float[np.nd
 
 
 def _split(ratio: Float[np.ndarray, "photos cells"]):
-    """Split log values into log power per photo plus log albedo per cell; return also the lit samples' misfit.
+    """Split log values into log albedo per cell and log power per photo; return that, and the lit samples' misfit.
 
     The misfit is a median.
     """
@@ -132,4 +147,4 @@ def _split(ratio: Float[np.ndarray, "photos cells"]):
     for _ in range(ROUNDS):
         albedo = column_quantile(ratio - power[:, None], LIT_QUANTILE)
         power = np.nanmedian(ratio - albedo, axis=1)
-    return power, albedo, float(np.nanmedian(np.abs(ratio - albedo - power[:, None])))
+    return power, float(np.nanmedian(np.abs(ratio - albedo - power[:, None])))
