@@ -5,12 +5,7 @@ from board_photos import corners_of, look_at, slanted
 
 from calibration.board.board import parse_board
 from calibration.board.corners import Corners
-from calibration.board.intrinsics import (
-    CENTRE_SIGMA,
-    K1_SIGMA,
-    K2_SIGMA,
-    fit_camera,
-)
+from calibration.board.intrinsics import CENTRE_SIGMA, K1_SIGMA, K2_SIGMA, fit_camera
 from calibration.camera import Camera, project_from
 from capture.decode.exif import FULL_FRAME_DIAGONAL
 from capture.errors import CalibrationError

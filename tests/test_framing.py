@@ -14,13 +14,7 @@ from calibration.light import Light
 from calibration.posed_camera import PosedCamera
 from calibration.reframed import UNPLACED, Doubt, reframed, with_doubt
 from capture.checks.check_stack import check_and_register
-from capture.checks.framing import (
-    NOT_SHOWN,
-    REFRAMED,
-    SEEN_FROM,
-    ZOOM_STATED,
-    framing_findings,
-)
+from capture.checks.framing import NOT_SHOWN, REFRAMED, SEEN_FROM, ZOOM_STATED, framing_findings
 from capture.photos.photo import PhotoStack
 
 N, SIZE = 8, (lit_table.WIDTH, lit_table.HEIGHT)

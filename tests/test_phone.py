@@ -11,12 +11,7 @@ from calibration.board.corners import Corners
 from calibration.camera import Camera
 from calibration.flashlight.led_photo import BackView, LensReading
 from calibration.flashlight.model import Flashlights
-from calibration.flashlight.phone import (
-    PhoneViews,
-    locate_lights_from_phone,
-    pair_in_order,
-    pair_in_step,
-)
+from calibration.flashlight.phone import PhoneViews, locate_lights_from_phone, pair_in_order, pair_in_step
 from calibration.pose import Pose
 from capture.errors import CalibrationError
 

@@ -9,9 +9,7 @@ from capture.decode.exif import read_header
 from capture.photos.photo import read_photo
 from examples.generator.options import Exposure, Pipeline, Setup
 from examples.generator.photo_file import DARK_ISO, SHUTTER_S, PhotoFile, developed, write_photo
-from examples.generator.pipeline import (
-    Shutter,
-)
+from examples.generator.pipeline import Shutter
 
 USUAL = Shutter(SHUTTER_S, DARK_ISO)
 CLEAN = Pipeline(pipeline=True, vignetting=0, lift=0, s_curve=0, denoise=0, sharpen=0, pipeline_jpeg=98)

@@ -20,12 +20,7 @@ from reconstruct.check.readiness import judge, refuse_hopeless
 from reconstruct.check.verdict import CaptureCheck
 from reconstruct.source.photos import Photos
 from reconstruct.source.source import RunOptions, Source
-from viewer.report.check_page import (
-    PAGE,
-    check_lines,
-    shadow_picture,
-    write_check,
-)
+from viewer.report.check_page import PAGE, check_lines, shadow_picture, write_check
 
 
 @pytest.fixture(scope="module")

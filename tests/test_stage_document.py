@@ -5,13 +5,7 @@ import json
 import pytest
 
 from capture.errors import CalibrationError
-from reconstruct.stored_run.stage_document import (
-    EMPTY,
-    LARGEST,
-    parsed_stage,
-    read_stage_document,
-    save_stage_document,
-)
+from reconstruct.stored_run.stage_document import EMPTY, LARGEST, parsed_stage, read_stage_document, save_stage_document
 
 NOTE = {"kind": "arrow", "text": "a crack", "at": [1.0, 2, 3], "normal": [0, 0, 1]}
 VIEW = {

@@ -6,13 +6,7 @@ import pytest
 import trimesh
 
 from viewer.display import layers
-from viewer.display.layers import (
-    FIRST_FOV,
-    framed_view,
-    light_position,
-    page_mesh,
-    page_scale,
-)
+from viewer.display.layers import FIRST_FOV, framed_view, light_position, page_mesh, page_scale
 from viewer.display.run_follower import RunFollower, loss_curves, size_text, status
 from viewer.page.controls import continued
 from viewer.page.page import Page

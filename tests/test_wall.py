@@ -8,12 +8,7 @@ from scipy.integrate import dblquad
 
 from calibration.flashlight import wall as walls
 from calibration.flashlight.fit import fit_flashlights
-from calibration.flashlight.model import (
-    Evidence,
-    Flashlights,
-    free_tangent,
-    log_irradiance,
-)
+from calibration.flashlight.model import Evidence, Flashlights, free_tangent, log_irradiance
 from calibration.flashlight.wall import wall_light
 from calibration.lights.ground_cells import GroundCells
 
