@@ -220,15 +220,16 @@ def test_import_refuses_a_folder_that_holds_something_and_leaves_it_alone(tmp_pa
 
 def test_a_folder_of_two_layouts_is_called_so_and_a_list_that_is_named_for_the_lights_makes_none(tmp_path):
     truth = seen_from_above(side=32, n_lights=6)
-    write_rti(tmp_path, truth)
-    write_diligent(tmp_path / "both", truth, np.ones((6, 3)))
-    write_rti(tmp_path / "both", truth)
+    one, both = tmp_path / "one", tmp_path / "both"
+    for folder in (one, both):
+        write_rti(folder, truth)
+    write_diligent(both, truth, np.ones((6, 3)))
     with pytest.raises(CaptureError, match=r"DiLiGenT .* by light_directions.txt .* and RTI .* by assembly-files"):
-        find_importer(tmp_path / "both")
-    photos = tmp_path / "jpeg-exports"
+        find_importer(both)
+    photos = one / "jpeg-exports"
     (photos / "stone_07.png").write_bytes((photos / "stone_01.png").read_bytes())
-    assert find_importer(tmp_path, tmp_path / "assembly-files" / "stone.lp") is None
-    assert find_importer(tmp_path, tmp_path / "lights.json") is not None
+    assert find_importer(one, one / "assembly-files" / "stone.lp") is None
+    assert find_importer(one, tmp_path / "lights.json") is not None
 
 
 def bare_photos(folder):
