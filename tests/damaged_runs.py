@@ -16,15 +16,14 @@ import fake_run
 import numpy as np
 import torch
 from fuzz_images import DAMAGES
+from laid_anew import turned_by
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from scipy.spatial.transform import Rotation
 from strange_runs import DOCUMENTS, MARKUP, STRANGE
 from test_untrusted_files import Payload
 
 from calibration.calibrated_views import CalibratedView, CalibratedViews, save_views
 from calibration.calibration import Calibration, load_calibration, save_calibration
-from calibration.pose import Pose
 from calibration.side_view import SideView
 from reconstruct.appearance.brdf import LOBES, Gloss
 from reconstruct.detail.file import DETAIL, Detail, save_details
@@ -88,16 +87,13 @@ def make(folder: Path, has_stage: bool = True) -> Path:
 def make_several(folder: Path) -> Path:
     """The same run with a second view, the object laid anew, a view that was left out, and a photo from the side."""
     run = make(folder, has_stage=False)
-    motion = Pose(Rotation.from_euler("z", 40, degrees=True).as_matrix(), np.array([80.0, -30.0, 0.0]))
-    own, back = load_calibration(run / "calibration.json"), motion.inverse()
+    own = load_calibration(run / "calibration.json")
     own = replace(own, side_views=(_side_view(own),))
-    lights = tuple(replace(x, position=back.apply(np.array(x.position))) for x in own.lights)
-    turned = replace(own, world_from_camera=back @ own.world_from_camera, lights=lights, side_views=())
-    object_pose = CalibratedViews((CalibratedView("turned_1", turned),), name="turned_1")
+    motion, object_pose = turned_by(own)
     views = (CalibratedView("view_1", own), CalibratedView("view_2", own))
     save_views(CalibratedViews(views, (("view_3", "no board was found"),), (object_pose,)), run / "calibration.json")
     fields = load_fields(run / "fields.safetensors")
-    poses = {"view_2": (own.world_from_camera, None), "turned_1": (turned.world_from_camera, motion)}
+    poses = {"view_2": (own.world_from_camera, None), "turned_1": (object_pose.first.world_from_camera, motion)}
     further = tuple(
         FurtherView(name, fields.albedo, fields.camera, pose, torch.ones(5, 4), object_from_world=moved)
         for name, (pose, moved) in poses.items()

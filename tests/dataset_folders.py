@@ -2,17 +2,22 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from synthetic import Truth
 
+from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.known_scene import KnownScene
 from calibration.light import Light
 from calibration.pose import Pose
 from calibration.scenes.importers import find_importer
 from capture.photos.photo import encode_srgb
+from reconstruct.source.calibrate_source import calibrate_source
+from reconstruct.source.photos import Photos, read_photos
+from reconstruct.source.source import RunOptions, Source, open_source
 
 
 def loaded(folder: Path) -> KnownScene:
@@ -20,6 +25,14 @@ def loaded(folder: Path) -> KnownScene:
     importer = find_importer(folder)
     assert importer is not None
     return importer.load(folder, "train")
+
+
+def calibrated(folder: Path, **options: Any) -> tuple[Source, tuple[Photos, ...], Calibration]:
+    """The folder as a run with these options finds it: its source, photos, and the calibration of its first view."""
+    chosen = RunOptions(**options)
+    source = open_source(folder, chosen)
+    photos = read_photos(source, chosen)
+    return source, photos, calibrate_source(source, photos, chosen).first
 
 
 OPENGL = np.diag([1.0, -1.0, -1.0])  # camera axes x right, y up, z back, from OpenCV's

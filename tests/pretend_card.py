@@ -17,9 +17,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
-from torch.utils.backend_registration import (
-    _setup_privateuseone_for_python_backend,  # pyright: ignore[reportPrivateUsage]
-)
+from torch.utils.backend_registration import _setup_privateuseone_for_python_backend  # pyright: ignore[reportPrivateUsage]
 
 NAME = "card"
 _setup_privateuseone_for_python_backend(NAME)

@@ -30,12 +30,9 @@ def session(folder, blank, n):
     return session_of(folder, [blank_photo(blank, CAMERA, pose) for pose in poses_over(blank, n)])
 
 
-def test_an_unknown_sheet_is_refused_with_the_known_ones():
+def test_an_unknown_sheet_is_refused_with_the_known_ones_and_a_blank_one_is_not_printed(tmp_path, capsys):
     with pytest.raises(CalibrationError, match=r"paper:A4, paper:letter, card"):
         parse_board("paper:B7")
-
-
-def test_a_blank_sheet_is_not_printed(tmp_path, capsys):
     assert shadowgraph.main(["board", str(tmp_path / "board.pdf"), "--board", "paper:A4"]) == 2
     assert "nothing to print" in capsys.readouterr().err
 
@@ -73,12 +70,9 @@ def test_camera_and_ground_come_from_a_blank_sheet(tmp_path):
     assert residuals["board"] == "paper:A4" and any("blank" in note for note in residuals["notes"])
 
 
-def test_another_paper_than_the_named_one_is_refused_by_its_ratio(tmp_path):
+def test_another_paper_than_the_named_one_is_refused_by_its_ratio_and_an_unnamed_one_pointed_out(tmp_path):
     with pytest.raises(CalibrationError, match=r"ratio 1\.29.*1\.414 was needed.*paper:letter"):
         fit_board(session(tmp_path, LETTER, 3), "paper:A4")
-
-
-def test_a_blank_sheet_that_nobody_named_is_pointed_out(tmp_path):
     with pytest.raises(CalibrationError, match=r"b0\.png seems to show a blank sheet.*paper:A4"):
         fit_board(session(tmp_path, A4, 1))
 

@@ -2,17 +2,25 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import pypdfium2
 import pytest
-from board_photos import board_photo, corners_of, look_at, slanted
+from board_photos import board_photo, corners_of, look_at, session_of, slanted
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
+import shadowgraph
 from calibration.board.board import Board, opencv_dictionary, parse_board
+from calibration.board.board_photos import fit_board
 from calibration.board.board_pose import board_views, fit_ground
 from calibration.board.corners import Corners, find_board
+from calibration.board.intrinsics import fit_camera
+from calibration.board.printing import DEFAULT_BOARDS, MM_PER_INCH, PAPERS, PNG_DPI, lay_out
 from calibration.board.recognise import guess_board
+from calibration.board.sheet import USUAL_SIZE, sheet_of, weigh_waves
 from calibration.camera import Camera
 from capture.errors import CalibrationError
+from capture.session.session import Session
 
 CHARUCO = parse_board("charuco:5x7:30:22:DICT_4X4_50")
 CHECKER = parse_board("checkerboard:9x6:24.25")
@@ -114,8 +122,12 @@ def test_a_checkerboard_cut_by_the_frame_is_found_as_a_part_and_only_where_a_par
     assert fit.world_from_camera.translation[2] == pytest.approx(POSE.translation[2], rel=5e-3)
 
 
-def test_a_mirrored_charuco_board_is_not_found():
+def test_no_board_is_found_in_a_mirror_in_noise_or_where_it_is_too_small():
     assert find_board(np.ascontiguousarray(board_photo(CHARUCO, CAMERA, POSE)[:, ::-1]), CHARUCO) is None
+    noise = np.random.default_rng(0).integers(0, 255, (480, 640)).astype(np.uint8)
+    assert find_board(noise, CHARUCO) is find_board(noise, CHECKER) is None
+    for size in ((60, 45), (160, 120)):  # no two corners lie so far apart that an edge between them may be bent
+        assert find_board(board_photo(CHARUCO, CAMERA.resized(*size), POSE), CHARUCO) is None
 
 
 def test_markers_too_blurred_to_be_read_still_tell_where_on_the_board_a_corner_is():
@@ -123,18 +135,6 @@ def test_markers_too_blurred_to_be_read_still_tell_where_on_the_board_a_corner_i
     assert cv2.aruco.CharucoDetector(CHARUCO.opencv()).detectBoard(photo)[1] is None
     corners = find_board(photo, CHARUCO)
     assert corners is not None and len(corners.pixels) >= 20 and off_px(corners).max() < 1
-
-
-@pytest.mark.parametrize("board", [CHARUCO, CHECKER], ids=lambda board: board.kind)
-def test_no_board_is_found_in_noise(board):
-    noise = np.random.default_rng(0).integers(0, 255, (480, 640)).astype(np.uint8)
-    assert find_board(noise, board) is None
-
-
-@pytest.mark.parametrize("size", [(60, 45), (160, 120)])
-def test_a_board_too_small_in_its_photo_is_not_found(size):
-    camera = CAMERA.resized(*size)  # no two corners lie so far apart that an edge between them may be bent
-    assert find_board(board_photo(CHARUCO, camera, POSE), CHARUCO) is None
 
 
 def test_an_unnamed_board_is_recognised():
@@ -155,12 +155,6 @@ def test_a_false_marker_beside_the_board_adds_no_rows():
 
 
 # --- pose
-
-
-def test_the_pose_has_its_origin_at_the_board_and_z_up():
-    pose = fit_ground(corners_of(CHARUCO, CAMERA, POSE), CAMERA).world_from_camera
-    assert np.allclose(pose.matrix(), POSE.matrix(), atol=1e-5)  # mm; the optimiser stops at 1e-8 relative
-    assert pose.translation[2] > 0
 
 
 def test_a_mirrored_pose_is_never_accepted():
@@ -192,23 +186,18 @@ def test_two_poses_that_explain_the_corners_alike_are_refused_not_chosen_between
     assert wrong > 0  # the smaller error alone would have taken the mirrored pose
 
 
-def test_a_small_far_board_is_refused_with_advice():
-    far = slanted(np.random.default_rng(8), 0.3, 6000)
-    with pytest.raises(CalibrationError, match="Photograph the board larger"):
-        fit_ground(corners_of(CHARUCO, CAMERA, far, 0.3, np.random.default_rng(9)), CAMERA)
-
-
-def test_the_wrong_board_is_refused():
-    seen = corners_of(CHARUCO, CAMERA, POSE)
+def test_a_small_far_board_the_wrong_one_and_four_corners_are_refused():
+    seen, some = corners_of(CHARUCO, CAMERA, POSE), [0, 3, 20, 23]
+    rng = np.random.default_rng(8)
+    far = corners_of(CHARUCO, CAMERA, slanted(rng, 0.3, 6000), 0.3, np.random.default_rng(9))
     swapped = seen.points.reshape(6, 4, 3)[:, [0, 2, 1, 3]].reshape(-1, 3)  # two columns of corners exchanged
-    with pytest.raises(CalibrationError, match=r"px off.*columns and rows"):
-        fit_ground(Corners(seen.pixels, swapped, CHARUCO), CAMERA)
-
-
-def test_four_corners_are_too_few_for_the_ground():
-    seen = corners_of(CHARUCO, CAMERA, POSE)
-    with pytest.raises(CalibrationError, match="4 corners"):
-        fit_ground(Corners(seen.pixels[[0, 3, 20, 23]], seen.points[[0, 3, 20, 23]], CHARUCO), CAMERA)
+    for corners, said in (
+        (far, "Photograph the board larger"),
+        (Corners(seen.pixels, swapped, CHARUCO), r"px off.*columns and rows"),
+        (Corners(seen.pixels[some], seen.points[some], CHARUCO), "4 corners"),
+    ):
+        with pytest.raises(CalibrationError, match=said):
+            fit_ground(corners, CAMERA)
 
 
 def test_the_stated_sigma_of_the_height_is_its_spread():
@@ -232,3 +221,117 @@ def test_a_board_without_any_noise_that_faces_the_camera_has_a_pose(height, asid
     found = fit_ground(corners_of(CHARUCO, CAMERA, pose), CAMERA).world_from_camera
     assert normal_error(found, pose) < 1e-4
     assert np.allclose(found.translation, pose.translation, atol=0.05)
+
+
+# --- photos of a session ---------------------------------------------------------------------------------------------
+
+
+def session(folder, poses, turned=()) -> Session:
+    photos = [board_photo(CHARUCO, CAMERA, pose) for pose in poses]
+    return session_of(folder, [np.rot90(photo).copy() if k in turned else photo for k, photo in enumerate(photos)])
+
+
+def test_a_session_gives_camera_and_ground_from_its_board_photos(tmp_path):
+    rng = np.random.default_rng(3)
+    poses = [look_at((150.0, -420.0, 380.0)), *(slanted(rng, tilt, 520) for tilt in (0.5, 0.8))]
+    posed_camera, _, residuals = fit_board(session(tmp_path, poses), CHARUCO.spec())
+    assert abs(posed_camera.camera.fx / CAMERA.fx - 1) < 0.01
+    assert np.degrees(np.arccos(posed_camera.world_from_camera.rotation[2] @ poses[0].rotation[2])) < 0.3
+    assert residuals["reprojection_rms_px"] < 0.3 and all(photo["used"] for photo in residuals["board_photos"])
+
+
+def test_a_board_photo_of_another_size_is_left_out_and_named(tmp_path):
+    poses = [look_at((150.0, -420.0, 380.0)), look_at((-100.0, -300.0, 450.0))]
+    residuals = fit_board(session(tmp_path, poses, turned=[1]), CHARUCO.spec())[2]
+    assert [photo["used"] for photo in residuals["board_photos"]] == [True, False]
+    assert "size" in residuals["board_photos"][1]["reason"]
+
+
+def test_a_tripod_photo_without_the_named_board_says_what_it_shows(tmp_path):
+    one = session(tmp_path, [look_at((150.0, -420.0, 380.0))])
+    with pytest.raises(CalibrationError, match=r"not found in b0\.png.*charuco:5x7"):
+        fit_board(one, "checkerboard:9x6:20")
+
+
+def test_what_no_photo_tells_of_a_board_is_doubted(tmp_path):
+    checker = parse_board("checkerboard:9x6:24.25")
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[42036] = "Phone 7 front camera 2.7mm f/2.2"
+    photo = board_photo(checker, CAMERA, look_at((150.0, -420.0, 380.0)))
+    one = session_of(tmp_path, [photo], ".jpg", quality=95, exif=exif)
+    residuals = fit_board(one)[2]
+    assert "millimetres are assumed" in residuals["notes"][0]
+    assumed, front = residuals["warnings"]
+    assert "30 mm" in assumed and "name the board" in assumed
+    assert "front camera" in front and "mirrored" in front
+    assert len(fit_board(one, checker.spec())[2]["warnings"]) == 1
+
+
+# --- sheets that do not lie flat -------------------------------------------------------------------------------------
+
+
+def test_the_heights_of_a_sheet_are_found_and_stand_on_the_table():
+    rng, board = np.random.default_rng(3), CHARUCO
+    x, y = board.points()[:, :2].T / 30
+    heights = 0.3 * (1 + np.cos(x + 1) * np.cos(0.7 * y))  # waves of 190 and 270 mm
+    lifted = board.points() + np.outer(heights, [0.0, 0.0, 1.0])
+    photos = []
+    for tilt in (0.9, 0.7, 0.8, 0.6):
+        pixels = CAMERA.project(slanted(rng, tilt, 520).inverse().apply(lifted)) + rng.normal(0, 0.05, (24, 2))
+        photos.append(Corners(pixels, board.points(), board))
+    fit = fit_camera(photos, (CAMERA.width, CAMERA.height), None)
+    found = fit.on_sheet(photos[0]).points[:, 2]
+    plane = np.column_stack([np.ones(24), board.points()[:, :2]])
+    bends = [z - plane @ np.linalg.lstsq(plane, z, rcond=None)[0] for z in (heights, found)]
+    assert np.abs(bends[1] - bends[0]).max() < 0.2 * np.ptp(bends[0])
+    assert -0.1 < found.min() < 0.02
+    assert any("wavy" in note for note in fit.notes)
+
+
+def test_waves_that_no_photo_tells_of_are_as_large_as_those_of_sheets_usually_are():
+    sheet = sheet_of([corners_of(CHARUCO, CAMERA, look_at((75.0, -105.0, 500.0)))])
+    assert sheet is not None
+    k = sheet.basis.shape[1]
+    unknown = weigh_waves(sheet, np.zeros(k), np.zeros((k, k)), 48.0, 48.0, 0.05)
+    assert unknown.size == 0 and unknown.possible == pytest.approx(USUAL_SIZE, rel=0.05)
+
+
+# --- a board that is printed -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", DEFAULT_BOARDS)
+@pytest.mark.parametrize("paper", PAPERS)
+def test_the_printed_board_is_found_again_at_its_true_size(tmp_path, capsys, kind, paper):
+    file = tmp_path / "board.pdf"
+    assert shadowgraph.main(["board", str(file), "--kind", kind, "--paper", paper]) == 0
+    said = capsys.readouterr().out
+    board = parse_board(said.split('board = "')[1].split('"')[0])
+    assert board.spec() == DEFAULT_BOARDS[kind]
+    page = pypdfium2.PdfDocument(file)[0]
+    sheet = sorted(side / 72 * MM_PER_INCH for side in page.get_size())
+    assert sheet == pytest.approx(sorted(PAPERS[paper]), abs=0.01)
+    drawn = np.asarray(page.render(scale=150 / 72).to_pil().convert("L"))
+    dots_per_mm = np.divide(drawn.shape[::-1], page.get_size()) * 72 / MM_PER_INCH  # rounded up to whole dots
+    png = np.asarray(Image.open(file.with_suffix(".png")))
+    for picture, scale in ((drawn, dots_per_mm), (png, PNG_DPI / MM_PER_INCH)):
+        corners = find_board(picture, board)
+        assert corners is not None and len(corners.pixels) == len(board.points())
+        seen = np.linalg.norm((corners.pixels[-1] - corners.pixels[0]) / scale)
+        assert seen == pytest.approx(
+            np.linalg.norm(corners.points[-1] - corners.points[0]), abs=0.1
+        )  # a dot is 0.17 and 0.08 mm
+
+
+def test_the_ruler_is_as_long_as_it_says(tmp_path):
+    shadowgraph.main(["board", str(tmp_path / "board.pdf")])
+    picture = Image.open(tmp_path / "board.png")
+    assert picture.info["dpi"] == pytest.approx((PNG_DPI, PNG_DPI), abs=0.1)
+    dots = PNG_DPI / MM_PER_INCH
+    line = np.asarray(picture)[round((PAPERS["a4"][1] - 13.5) * dots)]  # through the longest ticks
+    ticks = np.nonzero(np.diff((line < 128).astype(int)) == 1)[0]
+    assert len(ticks) == 11 and (ticks[-1] - ticks[0]) / dots == pytest.approx(100, abs=0.15)
+
+
+def test_a_board_too_large_for_the_paper_is_refused_with_both_sizes():
+    with pytest.raises(CalibrationError, match=r"Letter has 215.9 x 279.4"):
+        lay_out(parse_board("charuco:7x10:30:22:DICT_4X4_50"), "letter")

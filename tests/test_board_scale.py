@@ -15,7 +15,7 @@ from calibration.board.board_scale import scale_parts, scale_sentence
 from calibration.camera import Camera
 from capture.session.session import Session
 
-CAMERA = Camera(1200, 900, 1000.0, 1000.0, 599.5, 449.5)
+CAMERA = Camera(800, 600, 666.7, 666.7, 399.5, 299.5)
 BOARD = Board("charuco", 5, 7, 30.0, 22.0, "DICT_4X4_50")
 PHONE = {37386: IFDRational(56, 10), 41989: 26}  # focal length, and on full frame
 FOCUS = 37382

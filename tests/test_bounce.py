@@ -6,23 +6,31 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from fake_run import fields_of
+from fake_run import fields_of, mesh_of
 from jaxtyping import Float
+from stage_runs import SHAPES, stage_run, truth_of
 from synthetic import BALL, HEAP, Look, grid_of, render
 from test_relight import CAMERA, CENTRE, POSE, RADIUS, sphere_grid
 from torch.nn.functional import normalize
 
 from calibration.light import Light
+from reconstruct.export.stage_scene import stage_scene
 from reconstruct.fields import SolvedScene
 from reconstruct.labels.ground_test import empty_ground_test
 from reconstruct.labels.ground_test import test_ground as ground_tested
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.photometric_stereo import label_object
-from reconstruct.render.g_buffer import look
+from reconstruct.render.g_buffer import albedo_at, look, seen_material
 from reconstruct.render.interreflection import photo_interreflection, true_scale
-from reconstruct.render.radiosity import find_patches
+from reconstruct.render.radiosity import find_patches, nearest_patches
+from reconstruct.render.receivers import Receivers
 from reconstruct.render.relight import environment, relight
+from reconstruct.render.soft_light import soft_light
+from reconstruct.render.studio import direction_of, studio_of, towards
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.stored_run.stored_run import StoredRun
+from viewer.stage.facts import home_pose
+from viewer.stage.parts import first_view
 
 HEIGHT = float(CENTRE[2])
 OVERHEAD = Light("", "directional", direction=np.array([0.0, 0.0, 1.0]))
@@ -86,16 +94,13 @@ def test_in_a_white_furnace_the_ball_receives_what_the_ground_receives_and_nothi
     assert received.max() < 1.02
 
 
-def test_a_thin_wall_has_patches_on_both_sides():
+def test_a_thin_wall_has_patches_on_both_sides_and_the_bottom_of_the_world_none():
     nodes = torch.stack(torch.meshgrid(*[torch.arange(n).float() for n in (70, 70, 9)], indexing="ij"), -1)
     beyond = (nodes - torch.tensor([35.0, 35, 4.75])).abs() - torch.tensor([30.0, 30, 0.6])
     wall = find_patches(SdfGrid(beyond.amax(-1), torch.zeros(3), 1.0), None)
     assert wall is not None and wall.size > 2 * 0.6
     for facing in (1, -1):
         assert (facing * wall.normals[:, 2] > 0.9).sum() > 0.7 * (60 / wall.size) ** 2
-
-
-def test_the_bottom_of_the_world_has_no_patches():
     assert find_patches(SdfGrid(torch.ones(4, 4, 4), torch.zeros(3), 0.1), 0.0) is None
 
 
@@ -143,3 +148,53 @@ def test_light_between_surfaces_turns_no_normals(ground_known):
         return float(torch.rad2deg(cosine.clamp(-1, 1).arccos()).median())
 
     assert degrees_off(ours) < 0.3 * degrees_off(endless)
+
+
+# --- light of a sky and of one bounce, a vertex ----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module", params=list(SHAPES))
+def lit_scene(request):
+    """SolvedScene, mesh, its vertices and normals, its soft light."""
+    fields = fields_of(truth_of(request.param))
+    mesh = mesh_of(fields)
+    normals = torch.from_numpy(np.array(mesh.vertex_normals)).float()
+    points = torch.from_numpy(np.array(mesh.vertices)).float()
+    return fields, points, normals, soft_light(fields, seen_material(fields), mesh, normals)
+
+
+def test_what_lies_open_above_sees_all_of_the_sky_and_an_underside_none(lit_scene):
+    _, points, normals, soft = lit_scene
+    top = (normals[:, 2] > 0.99) & (points[:, 2] > points[:, 2].max() - 1)
+    under = (normals[:, 2] < -0.95) & (points[:, 2] > 4)
+    assert soft.sky[top].mean() > 0.9
+    assert soft.sky.min() >= 0 and soft.sky.max() <= 1.001
+    if under.any():
+        assert soft.sky[under].mean() < 0.1
+
+
+def test_four_numbers_tell_the_bounce_of_lamps_from_all_sides(lit_scene):
+    fields, points, normals, soft = lit_scene
+    patches = find_patches(fields.grid, fields.ground_height)
+    assert patches is not None
+    albedo = albedo_at(fields, seen_material(fields), patches.points, patches.on_object)
+    between = nearest_patches(patches, points, normals)
+    at = Receivers(fields.grid, patches.points, patches.normals, patches.starts)
+    for azimuth, elevation in ((0.3, 0.5), (2.5, 0.9), (4.4, 1.4)):
+        way = torch.from_numpy(towards(azimuth, elevation)).float()
+        direct = at.from_afar(way[None])[0][:, None].expand(-1, 3)
+        wanted = between.interpolated(patches.bounced(albedo, direct))
+        found = soft.arriving(way, 1.0, 0.0)
+        assert (found - wanted).abs().mean() < 0.25 * wanted.mean()
+        assert np.corrcoef(found.mean(-1), wanted.mean(-1))[0, 1] > 0.85
+
+
+@pytest.mark.parametrize("name", list(SHAPES))
+def test_the_first_lamp_stands_high_and_aside_and_shows_more_than_one_at_the_camera(name, tmp_path):
+    run = StoredRun(stage_run(tmp_path, name))
+    studio = studio_of(np.asarray(run.mesh.bounds))
+    view = first_view(run, studio, stage_scene(run))
+    camera = direction_of(home_pose(run.fields, studio).translation - studio.centre)[0]
+    azimuth, elevation = view.lamp
+    assert 34 < np.degrees(elevation) < 66 and 29 < abs(np.degrees(azimuth - camera)) < 61
+    assert view.entropy(azimuth, elevation) > view.entropy(camera, elevation)

@@ -75,11 +75,18 @@ def test_where_nearly_all_photos_are_left_out_the_refusal_says_why(truth, tmp_pa
             calibrate(session_of(truth), truth.stack, findings=findings)
 
 
-@pytest.mark.parametrize("sigma", [{}, {"sigma": [5, 5, 5]}])
-def test_a_list_of_lights_below_the_ground_is_refused_by_its_own_name(truth, tmp_path, sigma):
-    rows = [{"photo": x.photo, "position": (np.array(x.position) * [1, 1, -1]).tolist()} | sigma for x in truth.lights]
+@pytest.mark.parametrize(
+    ("factor", "more", "said"),
+    [
+        ([1, 1, -1], {}, "the light of IMG_0000\\.jpg below the ground"),
+        ([1, 1, -1], {"sigma": [5, 5, 5]}, "the light of IMG_0000\\.jpg below the ground"),
+        ([1e-3] * 3, {}, r"the lights .* mm \(median\) from the ground point .* in millimetres"),
+    ],
+)
+def test_a_list_of_lights_below_the_ground_or_in_metres_is_refused_by_its_own_name(truth, tmp_path, factor, more, said):
+    rows = [{"photo": x.photo, "position": (np.array(x.position) * factor).tolist()} | more for x in truth.lights]
     (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}))
-    with pytest.raises(CalibrationError, match=r"lights\.json puts the light of IMG_0000\.jpg below the ground"):
+    with pytest.raises(CalibrationError, match=rf"lights\.json puts {said}"):
         calibrate_with_file(session_of(truth), truth.stack, tmp_path / "lights.json")
 
 
@@ -95,15 +102,6 @@ def test_photos_from_the_side_count_with_lights_from_a_file_too(truth, tmp_path,
     assert truth.errors(result.lights).max() == 0
 
 
-def test_a_list_of_lights_in_metres_is_refused(truth, tmp_path):
-    rows = [{"photo": light.photo, "position": (np.array(light.position) / 1000).tolist()} for light in truth.lights]
-    (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}))
-    with pytest.raises(
-        CalibrationError, match=r"lights\.json puts the lights .* mm \(median\) from the ground point .* in millimetres"
-    ):
-        calibrate_with_file(session_of(truth), truth.stack, tmp_path / "lights.json")
-
-
 def test_photos_of_another_size_than_the_board_photo_are_refused(truth, tmp_path):
     (tmp_path / "lights.lp").write_text("\n".join(f"{path.name} 0 0 1" for path in truth.stack.paths))
     turned = replace(truth.stack, full_width=480, full_height=640)
@@ -116,12 +114,9 @@ def test_photos_of_another_size_than_the_board_photo_are_refused(truth, tmp_path
         calibrate(session_of(truth), filmed)
 
 
-def test_lights_by_phone_need_photos_by_that_phone(truth):
+def test_lights_by_phone_need_photos_by_that_phone_and_an_unknown_way_is_the_callers_mistake(truth):
     with pytest.raises(CalibrationError, match="no photos by the flashlight's phone in capture"):
         calibrate(session_of(truth), truth.stack, lights="phone")
-
-
-def test_an_unknown_way_to_find_lights_is_the_callers_mistake(truth):
     with pytest.raises(ValueError, match="auto, shading, phone"):
         calibrate(session_of(truth), truth.stack, lights="guess")
 

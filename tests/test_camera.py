@@ -5,13 +5,10 @@ from board_photos import corners_of, look_at, slanted
 
 from calibration.board.board import parse_board
 from calibration.board.corners import Corners
-from calibration.board.intrinsics import (
-    CENTRE_SIGMA,
-    K1_SIGMA,
-    K2_SIGMA,
-    fit_camera,
-)
+from calibration.board.intrinsics import CENTRE_SIGMA, K1_SIGMA, K2_SIGMA, fit_camera
 from calibration.camera import Camera, project_from
+from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.decode.exif import FULL_FRAME_DIAGONAL
 from capture.errors import CalibrationError
 
@@ -147,3 +144,25 @@ def test_points_are_projected_as_opencv_projects_them(distortion):
     points = camera.unproject(pixels) * np.random.default_rng(8).uniform(200, 900, (500, 1))
     expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix(), np.array(distortion))[0][:, 0]
     np.testing.assert_allclose(camera.project(points), expected, atol=1e-9)
+
+
+# --- a camera with its place -----------------------------------------------------------------------------------------
+
+
+DOWN = np.diag([1.0, -1.0, -1.0])  # x right, image down is -y, forward is -z
+LENS = Camera(640, 480, 600.0, 600.0, 319.5, 239.5, (-0.1, 0.02, 0.0, 0.0, 0.0))
+ABOVE = PosedCamera(LENS, Pose(DOWN, np.array([10.0, 20.0, 300.0])), 50.0)
+PIXELS = np.array([[319.5, 239.5], [0.0, 0.0], [600.0, 100.0]])
+
+
+def test_a_camera_that_looks_straight_down_sees_the_ground_below_it_and_nothing_behind():
+    np.testing.assert_allclose(ABOVE.looked_at(), [10, 20, 50])
+    np.testing.assert_allclose(ABOVE.on_ground(PIXELS[:1]), [[10, 20, 50]], atol=1e-9)
+    np.testing.assert_array_equal(ABOVE.forward, [0, 0, -1])
+    points = ABOVE.on_ground(PIXELS)
+    np.testing.assert_allclose(points[:, 2], 50)
+    np.testing.assert_allclose(ABOVE.project(points), PIXELS, atol=1e-3)
+    np.testing.assert_allclose(points, ABOVE.centre + 250 * ABOVE.rays(PIXELS), atol=1e-9)
+    pixels, depth = ABOVE.project_with_depth(np.array([[10.0, 20.0, 100.0], [0.0, 0.0, 400.0]]))
+    np.testing.assert_allclose(depth, [200, -100])
+    np.testing.assert_allclose(pixels, [[319.5, 239.5]] * 2)

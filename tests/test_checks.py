@@ -1,11 +1,14 @@
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import lit_table
 import numpy as np
 import pytest
 
+from capture.checks.alignment import BOARD_OFF
+from capture.checks.camera_motion import SMEARED, edge_sharpness
 from capture.checks.check_stack import check_stack
 from capture.checks.robust import column_quantile
 
@@ -28,11 +31,8 @@ def dropped(findings):
     return [(finding.photo.name, finding.kind) for finding in findings if finding.drop]
 
 
-def test_good_photos_have_no_findings(stack):
+def test_good_photos_have_no_findings_and_one_without_flash_is_found(stack):
     assert check_stack(stack) == ()
-
-
-def test_a_photo_without_flash_is_found(stack):
     ambient = stack.rgb.mean(0) * 0.05
     assert dropped(check_stack(with_photo(stack, 4, ambient))) == [("IMG_4.jpg", "flash off")]
 
@@ -166,3 +166,116 @@ def test_quantiles_of_columns_are_numpys_also_with_gaps_and_without_values():
             warnings.simplefilter("ignore")  # of the column without values
             expected = np.nanquantile(values, share, axis=0)
         np.testing.assert_allclose(column_quantile(values, share), expected, rtol=1e-12)
+
+
+# --- tripods that were pushed, judged by the photo of the board ------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def albedo():
+    return lit_table.table(np.random.default_rng(1))
+
+
+@pytest.fixture(scope="module")
+def board(albedo):
+    """The board where the object will stand, in even light."""
+    return a_board(lit_table.photograph(0.6 * lit_table.with_board(albedo, lit_table.TRIPOD_BOARD), of(3)))
+
+
+def of(seed):
+    return np.random.default_rng(seed)
+
+
+def a_board(rgb):
+    return replace(lit_table.stack_of([rgb]), paths=(Path("board/IMG_0.jpg"),))
+
+
+def pushed_from(stack, first, u=4.0, v=-3.0):
+    return replace(
+        stack, rgb=np.stack([lit_table.moved(rgb, u, v) if k >= first else rgb for k, rgb in enumerate(stack.rgb)])
+    )
+
+
+def names(findings):
+    return [(finding.photo.name, finding.kind, finding.drop) for finding in findings]
+
+
+def test_the_group_of_the_board_s_camera_counts_though_it_is_smaller(stack, board):
+    found = check_stack(pushed_from(stack, 5), board=board)
+    assert names(found) == [(f"IMG_{k}.jpg", BOARD_OFF, True) for k in range(5, N)]
+    assert "off board/IMG_0.jpg, the photo of the board, and the 5 photos that agree with it" in found[0].text
+    assert found[0].value == pytest.approx(5, abs=0.3)
+
+
+def test_the_larger_group_counts_where_the_board_belongs_to_it_or_tells_nothing(stack, board):
+    pushed = pushed_from(stack, 8)
+    later = [(f"IMG_{k}.jpg", "camera moved", True) for k in range(8, N)]
+    assert names(check_stack(pushed, board=board)) == later
+    other = a_board(lit_table.photograph(0.6 * lit_table.table(of(7)), of(8)))
+    assert names(check_stack(pushed, board=other)) == later
+    after = a_board(lit_table.moved(board.rgb[0], 4, -3))
+    assert names(check_stack(pushed, board=after)) == [(f"IMG_{k}.jpg", BOARD_OFF, True) for k in range(8)]
+
+
+@pytest.mark.parametrize("first", [0, 2])
+def test_a_tripod_pushed_after_the_board_is_told_of_each_photo_and_leaves_none_out(stack, board, first):
+    found = check_stack(pushed_from(stack, first), board=board)
+    early = [(f"IMG_{k}.jpg", "camera moved", True) for k in range(first)]
+    assert names(found) == early + [(f"IMG_{k}.jpg", BOARD_OFF, False) for k in range(first, N)]
+    assert found[-1].value == pytest.approx(5, abs=0.3) and "off that of board/IMG_0.jpg" in found[-1].text
+
+
+def test_photos_of_a_step_are_told_together_though_each_alone_is_not_sure(stack):
+    found = check_stack(pushed_from(stack, 7, 0.35, 0.2))
+    assert names(found) == [(f"IMG_{k}.jpg", "camera moved", True) for k in range(7, N)]
+
+
+# --- shake without texture -------------------------------------------------------------------------------------------
+
+
+HEIGHT, WIDTH, PHOTOS = 480, 640, 8
+ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+
+
+def _photo(k: int) -> np.ndarray:
+    """A bright disc with a dark square on plain ground under a light from one side; its shadow's edge is 8 px wide."""
+    rng, turn = np.random.default_rng(k), 2 * np.pi * k / PHOTOS
+    ground = 0.3 * np.exp(0.001 * (np.cos(turn) * (COLUMNS - 320) + np.sin(turn) * (ROWS - 240)))
+    shadow = np.hypot(COLUMNS - 320 + 60 * np.cos(turn), ROWS - 260 + 60 * np.sin(turn)) < 80
+    picture = ground * (1 - 0.9 * cv2.GaussianBlur(shadow.astype(np.float32), (0, 0), 4))
+    disc = np.hypot(COLUMNS - 320, ROWS - 240) < 90
+    picture = np.where(disc, 0.7 + 0.1 * np.cos(turn), picture)
+    picture = np.where((np.abs(COLUMNS - 320) < 30) & (np.abs(ROWS - 240) < 30), 0.15, picture)
+    return cv2.GaussianBlur(picture, (0, 0), 0.7) * (1 + 0.02 * rng.standard_normal((HEIGHT, WIDTH)))
+
+
+def _stack(pictures: list[np.ndarray]) -> list[np.ndarray]:
+    return [one.astype(np.float32) for one in pictures]
+
+
+def _shaken(picture: np.ndarray, angle: float, length: int = 6) -> np.ndarray:
+    way = length / 2 * np.array([np.cos(angle), np.sin(angle)])
+    moves = [np.array([[1, 0, x], [0, 1, y]], np.float32) for x, y in np.linspace(-way, way, 13)]
+    moved = [
+        cv2.warpAffine(picture.astype(np.float32), m, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REPLICATE) for m in moves
+    ]
+    return np.mean(moved, axis=0)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.5, 1.57, 2.5])
+def test_a_shaken_photo_of_a_plain_table_has_soft_edges(angle):
+    pictures = [_photo(k) for k in range(PHOTOS)]
+    assert (edge_sharpness(_stack(pictures)) > SMEARED).all()
+    pictures[3] = _shaken(pictures[3], angle)
+    np.testing.assert_array_equal(np.flatnonzero(edge_sharpness(_stack(pictures)) < SMEARED), [3])
+
+
+def test_edges_are_compared_at_one_size_and_not_in_small_pictures_or_where_there_are_none():
+    pictures = [_photo(k) for k in range(PHOTOS)]
+    pictures[5] = _shaken(pictures[5], 0.8)
+    large = [cv2.resize(one, None, fx=1.5, fy=1.5, interpolation=cv2.INTER_CUBIC) for one in pictures]
+    np.testing.assert_array_equal(np.flatnonzero(edge_sharpness(_stack(large)) < SMEARED), [5])
+    small = [cv2.resize(one, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for one in pictures]
+    assert np.isnan(edge_sharpness(_stack(small))).all()
+    plain = np.full((PHOTOS, HEIGHT, WIDTH), 0.4, np.float32)
+    assert np.isnan(edge_sharpness(list(plain))).all()

@@ -36,23 +36,14 @@ def times_of(paths):
     return np.array([found[1] for path in paths if (found := clip_of(path))])
 
 
-def test_only_moments_under_the_flashlight_are_chosen_in_their_order(chosen):
+def test_sharp_moments_under_the_flashlight_from_all_around_are_chosen_and_board_and_dark_before_and_after(chosen):
     times = times_of(chosen.lit)
     assert len(times) == N and (np.diff(times) > 0).all()
     assert times[0] >= ROOM_S + ARM_S and times[-1] <= ROOM_S + ARM_S + LIT_S
-
-
-def test_the_chosen_lights_come_from_all_around_without_duplicates(chosen):
-    angle = clips.light_angle(times_of(chosen.lit)) % (2 * np.pi)
+    angle = clips.light_angle(times) % (2 * np.pi)
     gaps = np.diff(np.sort(np.append(angle, angle.min() + 2 * np.pi)))
     assert np.degrees(gaps).max() < 45 and np.degrees(gaps).min() > 4  # evenly would be 18 degrees
-
-
-def test_blurred_frames_are_not_chosen(chosen):
-    assert not any(clips.is_blurred(time_s) for time_s in times_of(chosen.lit))
-
-
-def test_the_board_is_taken_from_the_room_lit_start_and_the_dark_from_the_end(chosen):
+    assert not any(clips.is_blurred(time_s) for time_s in times)
     assert len(chosen.board) == 1 and times_of(chosen.board)[0] < ROOM_S
     assert len(chosen.dark) >= 3 and times_of(chosen.dark).min() >= ROOM_S + ARM_S + LIT_S
     assert "20 frames" in chosen.note and "room light" in chosen.note

@@ -83,62 +83,46 @@ def test_files_elsewhere_are_out_of_reach(task, photo, tmp_path):
     assert_goes_on(tmp_path)
 
 
-@needs_landlock(1)
-def test_no_program_is_run(photo):
-    with pytest.raises(CaptureError, match=r"photo\.tif is damaged .*Permission denied"):
-        first_answer(hostile.runs_a_program, photo)
-
-
-@needs_landlock(NETWORK_FROM)
-def test_nothing_is_connected_to(photo):
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        photo.write_text(str(server.getsockname()[1]))
-        with pytest.raises(CaptureError, match=r"photo\.tif is damaged .*Permission denied"):
-            first_answer(hostile.connects, photo)
-
-
-@needs_landlock(SCOPES_FROM)
-def test_no_other_process_is_signalled(photo):
+@pytest.mark.parametrize(
+    ("task", "said"),
+    [
+        pytest.param(hostile.runs_a_program, "Permission denied", marks=needs_landlock(1)),
+        pytest.param(hostile.connects, "Permission denied", marks=needs_landlock(NETWORK_FROM)),
+        pytest.param(hostile.signals_its_parent, "not permitted", marks=needs_landlock(SCOPES_FROM)),
+        (hostile.writes_to_what_is_open, "File too large"),
+    ],
+)
+def test_no_program_is_run_nothing_connected_to_no_process_signalled_and_nothing_written(task, said, photo):
     heard = []
     before = signal.signal(signal.SIGUSR1, lambda *_: heard.append(1))
     try:
-        with pytest.raises(CaptureError, match=r"photo\.tif is damaged .*not permitted"):
-            first_answer(hostile.signals_its_parent, photo)
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            photo.write_text(str(server.getsockname()[1]))
+            with pytest.raises(CaptureError, match=rf"photo\.tif is damaged .*{said}"):
+                first_answer(task, photo)
     finally:
         signal.signal(signal.SIGUSR1, before)
     assert not heard
-
-
-def test_nothing_is_written_even_to_what_is_open(photo):
-    with pytest.raises(CaptureError, match=r"photo\.tif is damaged .*File too large"):
-        first_answer(hostile.writes_to_what_is_open, photo)
 
 
 def test_few_files_can_be_open(photo):
     assert first_answer(hostile.opens_what_it_can, photo).numbers == (2,)
 
 
-def test_memory_is_what_the_picture_is_worth(photo, tmp_path, monkeypatch):
-    monkeypatch.setattr(confined, "FIXED_ROOM", 100 << 20)
-    monkeypatch.setattr(confined, "ROOM_PER_CORE", 0)
-    with pytest.raises(CaptureError, match=r"photo\.tif could not be decoded within 0\.6 GB of memory"):
-        first_answer(hostile.takes_memory, photo, 10_000_000)
-    assert_goes_on(tmp_path)
-
-
-def test_computing_without_end_is_ended(photo, tmp_path, monkeypatch):
-    monkeypatch.setattr(confined, "SECONDS", 0.5)
-    monkeypatch.setattr(confined, "PATIENCE", 1000)
-    with pytest.raises(CaptureError, match=r"photo\.tif could not be decoded within 1 s"):
-        first_answer(hostile.computes_without_end, photo, 1)
-    assert_goes_on(tmp_path)
-
-
-def test_waiting_without_end_is_ended(photo, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("task", "pixels", "limits", "said"),
+    [
+        (hostile.takes_memory, 10_000_000, {"FIXED_ROOM": 100 << 20, "ROOM_PER_CORE": 0}, r"0\.6 GB of memory"),
+        (hostile.computes_without_end, 1, {"SECONDS": 0.5, "PATIENCE": 1000}, "1 s"),
+        (hostile.waits_without_end, 0, {"PATIENCE": 0.02}, "0 s"),
+    ],
+)
+def test_memory_and_time_are_what_the_picture_is_worth(task, pixels, limits, said, photo, tmp_path, monkeypatch):
     with monkeypatch.context() as short:
-        short.setattr(confined, "PATIENCE", 0.02)
-        with pytest.raises(CaptureError, match=r"photo\.tif could not be decoded within 0 s"):
-            first_answer(hostile.waits_without_end, photo)
+        for name, value in limits.items():
+            short.setattr(confined, name, value)
+        with pytest.raises(CaptureError, match=rf"photo\.tif could not be decoded within {said}"):
+            first_answer(task, photo, pixels)
     assert_goes_on(tmp_path)
 
 

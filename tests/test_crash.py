@@ -170,18 +170,13 @@ def test_the_last_two_checkpoints_are_kept_and_a_damaged_one_is_passed_over_with
     assert stored(path) is None
 
 
-def test_a_checkpoint_of_another_version_or_run_is_named_and_not_used(tmp_path):
+def test_a_checkpoint_of_another_version_or_run_is_named_and_not_used_and_what_is_no_number_never_written(tmp_path):
     path = tmp_path / "checkpoint.safetensors"
     store(path, 1.0)
     for version, fingerprint, word in (("2", "mine", "format 1, this version reads 2"), ("1", "other", "settings")):
         said = []
         assert read_checkpoint(path, version, fingerprint, said.append) is None
         assert len(said) == 1 and word in said[0]
-
-
-def test_what_is_no_number_is_never_written(tmp_path):
-    path = tmp_path / "checkpoint.safetensors"
-    store(path, 1.0)
     for value in (float("nan"), float("inf")):
         with pytest.raises(ReconstructionError, match="1000 of 1000 values of 'phi' are not finite"):
             store(path, value)

@@ -5,10 +5,10 @@ import json
 import cv2
 import numpy as np
 import pytest
+from dataset_folders import calibrated
 
 from calibration.scenes.deepshadow import load_deepshadow
 from capture.errors import CalibrationError, UserError
-from reconstruct.source.calibrate_source import calibrate_source
 from reconstruct.source.photos import read_photos
 from reconstruct.source.source import RunOptions, open_source
 
@@ -16,21 +16,21 @@ SIZE = 32
 LIGHTS = [("cup_0_0", (8.0, 0.5, 2.0)), ("cup_0_1", (-3.0, 7.0, 4.0)), ("cup_0_2", (-6.0, -4.0, 3.0))]
 
 
-def write_scene(folder, background=True, height=1.0):
+def write_scene(folder):
     """Three grey shadow pictures and their lights."""
     (folder / "0").mkdir()
     lines = [f"{name} {x} {y} {z}" for name, (x, y, z) in LIGHTS]
     (folder / "all_object_lights.txt").write_text("\n".join(lines) + "\n")
-    given = {"focal_length": 44.0, "cam_location_x": 0.0, "cam_location_y": 0.0, "cam_location_z": height}
+    given = {"focal_length": 44.0, "cam_location_x": 0.0, "cam_location_y": 0.0, "cam_location_z": 1.0}
     (folder / "params.json").write_text(json.dumps(given))
     for i, (name, _) in enumerate(LIGHTS):
         cv2.imwrite(str(folder / "0" / f"{name}_shadow1.png"), np.full((SIZE, SIZE), 40 * (i + 1), np.uint8))
     silhouette = np.full((SIZE, SIZE), 255, np.uint8)
-    silhouette[:, : SIZE // 2] = 0 if background else 255
+    silhouette[:, : SIZE // 2] = 0
     cv2.imwrite(str(folder / "0" / "cup_silhouette.png"), silhouette)
 
 
-def test_shadow_pictures_stay_grey_and_the_silhouette_is_the_mask_unless_left_out(tmp_path):
+def test_shadow_pictures_stay_grey_and_the_silhouette_is_the_mask_unless_left_out_or_without_background(tmp_path):
     write_scene(tmp_path)
     pictures = read_photos(open_source(tmp_path, RunOptions(input="shadow")), RunOptions(input="shadow"))[0]
     assert pictures.stack is None and pictures.shadow is not None and pictures.mask is not None
@@ -38,19 +38,14 @@ def test_shadow_pictures_stay_grey_and_the_silhouette_is_the_mask_unless_left_ou
     assert pictures.mask.mean() == 0.5
     without = RunOptions(mask="none")
     assert read_photos(open_source(tmp_path, without), without)[0].mask is None
-
-
-def test_a_silhouette_without_background_says_nothing(tmp_path):
-    write_scene(tmp_path, background=False)
+    cv2.imwrite(str(tmp_path / "0" / "cup_silhouette.png"), np.full((SIZE, SIZE), 255, np.uint8))
     assert load_deepshadow(tmp_path).mask_path is None
 
 
 def test_an_unknown_ground_is_an_assumption_that_the_result_names(tmp_path):
     write_scene(tmp_path)
-    options = RunOptions()
-    source = open_source(tmp_path, options)
-    calibration = calibrate_source(source, read_photos(source, options), options).first
-    assert not source.ground_is_known(options)
+    source, _, calibration = calibrated(tmp_path)
+    assert not source.ground_is_known(RunOptions())
     assert "ground is unknown" in calibration.residuals["warnings"][-1]
     assert "assumed" in calibration.residuals["warnings"][-1]
 
@@ -58,10 +53,8 @@ def test_an_unknown_ground_is_an_assumption_that_the_result_names(tmp_path):
 @pytest.mark.parametrize(("ground", "words"), [("deep", "is no height"), ("nan", "is no height"), ("3", "above")])
 def test_an_impossible_ground_is_refused_by_name(tmp_path, ground, words):
     write_scene(tmp_path)
-    options = RunOptions(ground=ground)
     with pytest.raises(CalibrationError, match=words):
-        source = open_source(tmp_path, options)
-        calibrate_source(source, read_photos(source, options), options)
+        calibrated(tmp_path, ground=ground)
 
 
 @pytest.mark.parametrize(

@@ -2,16 +2,15 @@
 
 import json
 import re
-import struct
 import sys
 import zipfile
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from test_mesh import glb_parts
 
 import shadowgraph
 from capture.decode.exr import read_exr
@@ -30,11 +29,6 @@ def full(run):
 
 def written(run, tmp_path, name, options=SMALL, suffix=None):
     return export(run, name, tmp_path / f"it{suffix or FORMATS[name].suffix}", options)
-
-
-def glb_document(path: Path) -> dict:
-    data = path.read_bytes()
-    return json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
 
 
 @pytest.mark.parametrize("name", ["ply", "stl", "off"])
@@ -66,7 +60,7 @@ def test_a_glb_is_textured_in_metres_and_y_up(run, full, tmp_path):
     material = mesh.visual.material
     assert material.baseColorTexture.size == material.normalTexture.size == (128, 128)
     assert (material.metallicFactor, material.roughnessFactor) == (0, 1)
-    document = glb_document(it.path)
+    document = glb_parts(it.path)[0]
     attributes = document["meshes"][0]["primitives"][0]["attributes"]
     assert set(attributes) == {"POSITION", "NORMAL", "TANGENT", "TEXCOORD_0"}
     assert it.contents.is_closed is None and "cut along the seams" in it.contents.note
@@ -98,7 +92,7 @@ def test_a_usdz_is_one_package_in_metres(run, full, tmp_path):
     assert np.allclose(np.ptp(points, axis=0) * 1000, full.extents[[0, 2, 1]], atol=0.6)
 
 
-def test_normals_and_depth_come_back_from_16_bit_png_by_their_sidecar(run, tmp_path):
+def test_normals_and_depth_come_back_from_16_bit_png_by_their_sidecar_and_from_exr_exactly(run, tmp_path):
     depth, normal = np.load(run / "depth.npy"), np.load(run / "normal.npy")
     it = written(run, tmp_path, "depth-png")
     facts = json.loads((tmp_path / "it.json").read_text())
@@ -110,10 +104,6 @@ def test_normals_and_depth_come_back_from_16_bit_png_by_their_sidecar(run, tmp_p
     stored = cv2.imread(str(written(run, tmp_path, "normal-png").path), cv2.IMREAD_UNCHANGED)[..., ::-1]
     assert np.abs(stored[seen] / 65535 * 2 - 1 - normal[seen]).max() < 2e-5
     assert not stored[~seen].any()
-
-
-def test_normals_and_depth_come_back_from_exr_exactly(run, tmp_path):
-    depth, normal = np.load(run / "depth.npy"), np.load(run / "normal.npy")
     channels = read_exr(written(run, tmp_path, "depth-exr").path)
     assert np.array_equal(np.where(channels["A"] > 0, channels["Z"], np.inf), depth)
     channels = read_exr(written(run, tmp_path, "normal-exr").path)

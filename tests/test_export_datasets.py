@@ -170,11 +170,16 @@ def test_photos_of_the_capture_are_exported_where_they_are_given(finished, tmp_p
     np.testing.assert_array_equal(read_photo(out / "train" / "photo_01.png").rgb, original)
 
 
-def test_a_missing_photo_is_named_and_nothing_is_left(finished, tmp_path):
+def test_a_missing_photo_is_named_nothing_is_left_and_a_folder_that_holds_something_is_left_alone(finished, tmp_path):
     (tmp_path / "capture").mkdir()
     with pytest.raises(ReconstructionError, match=r"capture holds no photo_00\.png.*--photos"):
         exported(finished, "rti", tmp_path, tmp_path / "capture")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["capture"]
+    (tmp_path / "rti").mkdir()
+    (tmp_path / "rti" / "note.txt").write_text("mine")
+    with pytest.raises(ReconstructionError, match="exists and is not empty"):
+        exported(finished, "rti", tmp_path)
+    assert [path.name for path in (tmp_path / "rti").iterdir()] == ["note.txt"]
 
 
 def test_lights_that_the_solve_moved_are_exported_where_they_are_now(finished):
@@ -191,11 +196,3 @@ def test_lights_that_the_solve_moved_are_exported_where_they_are_now(finished):
 def test_every_layout_can_be_had_as_a_zip(finished, tmp_path, name):
     written = export(finished[0], name, tmp_path / "heap.zip")
     assert "4 pictures of the relit surface, camera and lights" in written.sentence()
-
-
-def test_a_folder_that_holds_something_is_left_alone(finished, tmp_path):
-    (tmp_path / "rti").mkdir()
-    (tmp_path / "rti" / "note.txt").write_text("mine")
-    with pytest.raises(ReconstructionError, match="exists and is not empty"):
-        exported(finished, "rti", tmp_path)
-    assert [path.name for path in (tmp_path / "rti").iterdir()] == ["note.txt"]

@@ -26,18 +26,14 @@ def ramp(tmp_path_factory):
     return path, (values - BLACK) / (WHITE - BLACK)
 
 
-def test_raw_is_linear_from_black_to_white_level(ramp):
+def test_raw_is_linear_from_black_to_white_level_and_clipped_near_it_with_its_neighbours(ramp):
     path, expected = ramp
     photo = read_photo(path)
     assert photo.is_linear and read_size(path) == (200, 40) == photo.rgb.shape[1::-1]
     row, inside = photo.rgb[20, 4:-4], expected[4:-4]  # the rim is extrapolated
     assert np.abs(row - inside[:, None])[inside < 0.99].max() < 1e-3
     assert row[inside > 1.01].min() == 1
-
-
-def test_raw_samples_near_the_white_level_are_clipped_with_their_neighbours(ramp):
-    path, expected = ramp
-    clipped = read_photo(path).clipped[20]
+    clipped = photo.clipped[20]
     assert (clipped == (expected >= CLIPPED_RAW)).mean() > 0.99
     assert clipped[expected >= CLIPPED_RAW].all()
 
@@ -49,17 +45,13 @@ def test_raw_colours_keep_the_sensors_own_balance(tmp_path):
     assert np.abs(read_photo(path).rgb[5:-5, 5:-5] - [0.2, 0.4, 0.6]).max() < 1e-3
 
 
-def test_a_raw_file_without_picture_data_is_refused(tmp_path):
+def test_a_raw_file_without_picture_data_or_cut_short_is_refused(tmp_path, ramp):
     path = write_dng(tmp_path / "empty.dng", np.full((32, 32), BLACK), BLACK, WHITE)
     with pytest.raises(CaptureError, match=r"empty\.dng has no picture in it"):
         read_photo(path)
-
-
-def test_a_raw_file_that_is_cut_short_is_refused(tmp_path, ramp):
-    path = tmp_path / "cut.dng"
-    path.write_bytes(ramp[0].read_bytes()[:9000])
+    (tmp_path / "cut.dng").write_bytes(ramp[0].read_bytes()[:9000])
     with pytest.raises(CaptureError, match=r"cut\.dng"):
-        read_photo(path)
+        read_photo(tmp_path / "cut.dng")
 
 
 @pytest.mark.parametrize("kind", [np.float16, np.float32])

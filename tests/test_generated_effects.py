@@ -16,16 +16,7 @@ from capture.decode.exif import read_header
 from capture.errors import CaptureError
 from capture.session.session import load_session
 from examples.generator import hand, poses
-from examples.generator.options import (
-    Exposure,
-    Flashlight,
-    Further,
-    Hand,
-    Phone,
-    Setup,
-    Table,
-    Thing,
-)
+from examples.generator.options import Exposure, Flashlight, Further, Hand, Phone, Setup, Table, Thing
 from examples.generator.sheet import lay
 
 BOARD = parse_board("charuco:5x7:30:22:DICT_4X4_50")

@@ -1,6 +1,5 @@
 """Truth: glossy spheres by GGX, which the lobes have to approximate, and matt ones without any gloss."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +9,13 @@ from glossy import highlight, polished
 from jaxtyping import Float
 from scipy import ndimage
 from synthetic import BALL, Look, Sphere, Truth, grid_of, render
+from test_mesh import glb_parts
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from calibration.light import Light, irradiance
-from reconstruct.appearance.brdf import Material, facing_reflectance, specular
+from reconstruct.appearance.brdf import LOBES, Material, facing_reflectance, specular
+from reconstruct.appearance.joint_fit import fit_normals
 from reconstruct.appearance.lobe_fit import Indirect, Samples, fit_lobes, from_endless_ground
 from reconstruct.fields import SolvedScene
 from reconstruct.labels.ground_test import test_ground as check_ground
@@ -150,9 +152,7 @@ def test_gloss_is_that_of_the_part_that_shines():
 def test_the_glb_says_how_rough_the_object_is(fields, tmp_path):
     mesh = extract_mesh(fields)
     save_mesh(mesh, tmp_path / "mesh.ply", tmp_path / "mesh.glb", "mm", mesh_material(fields, mesh))
-    data = (tmp_path / "mesh.glb").read_bytes()
-    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
-    material = document["materials"][0]["pbrMetallicRoughness"]
+    material = glb_parts(tmp_path / "mesh.glb")[0]["materials"][0]["pbrMetallicRoughness"]
     assert material["roughnessFactor"] == pytest.approx(ROUGHNESS, abs=0.08)
     assert material["metallicFactor"] < 0.15
     assert mesh_material(replace(fields, gloss=None), mesh) is None
@@ -199,3 +199,43 @@ def test_ground_without_a_lit_label_gets_its_albedo_where_the_surface_lets_light
     assert shade.sum() > 50 and not found[shade].any()
     assert np.median(np.abs(found / truth.albedo - 1)[light]) < 0.02
     assert np.array_equal(found[truth.mask], truth.albedo[truth.mask].astype(np.float32))
+
+
+# --- normals and albedos of pixels whose lobes are known -------------------------------------------------------------
+
+
+PIXELS, PHOTOS = 300, 24
+LIT = 0.02  # of what the tilted start is off, without noise
+
+
+def samples(is_glossy: bool) -> tuple[Samples, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Noiseless samples with tilted normals to begin from, and their lobes, true normals and albedos."""
+    torch.manual_seed(0)
+    up, sideways = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, 1.0, 0.0])
+    true = normalize(0.4 * sideways * torch.randn(PIXELS, 3) + up, dim=-1)
+    eye = normalize(0.1 * torch.randn(PIXELS, 3) + up, dim=-1)
+    lights = normalize(0.7 * sideways * torch.randn(PHOTOS, 3) + up, dim=-1)
+    towards = normalize(lights + 0.02 * torch.randn(PIXELS, 1, 3), dim=-1)
+    lobes = torch.zeros(LOBES, 3)
+    if is_glossy:
+        lobes[1], lobes[3] = torch.tensor([0.2, 0.15, 0.1]), 0.1
+    strength, indirect = torch.ones(PIXELS, PHOTOS, 3), torch.full((PIXELS, PHOTOS, 3), 0.02)
+    albedo = 0.2 + 0.5 * torch.rand(PIXELS)
+    cosine = (towards * true[:, None]).sum(-1, keepdim=True).clamp(min=0)
+    mirrored = specular(lobes, true[:, None], towards, eye[:, None])
+    value = (albedo[:, None, None] + mirrored) * cosine * strength + albedo[:, None, None] * indirect
+    start = normalize(true + 0.1 * torch.randn(PIXELS, 3), dim=-1)
+    return Samples(value, torch.ones(PIXELS, PHOTOS), strength, indirect, towards, eye, start), lobes, true, albedo
+
+
+def angles(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Radians between unit vectors."""
+    return 2 * ((a - b).norm(dim=-1) / 2).clamp(max=1).asin()
+
+
+@pytest.mark.parametrize("is_glossy", [False, True])
+def test_noiseless_samples_give_back_normals_and_albedos(is_glossy):
+    given, lobes, true, albedo = samples(is_glossy)
+    normals, found, cost = fit_normals(given, lobes, torch.full((PIXELS, PHOTOS), 0.002))
+    assert angles(normals, true).quantile(0.95) < LIT * angles(given.normals, true).median()
+    assert ((found - albedo) / albedo).abs().median() < 0.001 and cost.median() < 1e-3

@@ -11,12 +11,7 @@ from test_solver import Listener
 from calibration.camera import Camera
 from calibration.pose import Pose
 from reconstruct.config import FitConfig, Level
-from reconstruct.initialization.choose_start import (
-    JUDGES_BLOCK,
-    JUDGES_SEED,
-    JUDGES_SHARE,
-    choose_start,
-)
+from reconstruct.initialization.choose_start import JUDGES_BLOCK, JUDGES_SEED, JUDGES_SHARE, choose_start
 from reconstruct.initialization.height_field import HeightConfig, HeightField, fit_heights
 from reconstruct.initialization.height_grid import base_of, height_grid
 from reconstruct.initialization.height_view import height_view

@@ -5,17 +5,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from brief_drafts import NORMAL_STEPS
 from flashlight_photos import looking_at
-from scipy.ndimage import label
-from synthetic import BALL, HEAP, Box, Look, Sphere, default_camera, render
+from scipy.ndimage import binary_erosion, label
+from synthetic import BALL, HEAP, Box, Look, Sphere, default_camera, grid_of, render
 
 from calibration.camera import Camera
 from calibration.posed_camera import PosedCamera
 from calibration.side_view import SideView
 from capture.errors import ReconstructionError
+from reconstruct.config import FitConfig, Level
+from reconstruct.hull import bent_hull
+from reconstruct.hull.bent_hull import on_front
+from reconstruct.hull.hull_matter import hull_occupancy
 from reconstruct.hull.hull_parts import PixelRays, most_needed
+from reconstruct.hull.normal_integration import integrate_within, likeness
 from reconstruct.hull.shadow_hull import shadow_hull
-from reconstruct.labels.labels import assemble_labels
+from reconstruct.initialization import choose_start
+from reconstruct.labels.labels import Labels, assemble_labels
+from reconstruct.labels.observer import Observer
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.level_set import resampled
+from reconstruct.shading import joint_normals
 
 LOOK = Look(with_shadow=True, with_mask=True, n_lights=24)
 
@@ -68,7 +79,7 @@ def test_an_object_nearly_as_high_as_the_camera_is_not_cut():
     assert float(grid.sdf(torch.tensor([[0.0, 0.0, 280.0]]))) < 0
 
 
-def test_one_wrong_light_is_forgiven_by_a_second_vote():
+def test_one_wrong_light_is_forgiven_by_a_second_vote_and_no_object_is_said_to_be_none():
     scene, _ = render((BALL,), LOOK)
     labels = labels_of(scene)
     longest = int(((labels.visibility < 0.5) & (labels.mask < 0.5)).sum((1, 2)).argmax())
@@ -76,11 +87,6 @@ def test_one_wrong_light_is_forgiven_by_a_second_vote():
     centre = torch.tensor([BALL.centre])
     assert float(shadow_hull(scene, labels, votes=1, nodes=40).sdf(centre)) > 0
     assert float(shadow_hull(scene, labels, votes=2, nodes=40).sdf(centre)) < 0
-
-
-def test_no_object_is_said_to_be_no_object():
-    scene, _ = render((BALL,), LOOK)
-    labels = labels_of(scene)
     labels.mask[...] = 0
     with pytest.raises(ReconstructionError, match="no object found"):
         shadow_hull(scene, labels, votes=1, nodes=40)
@@ -115,3 +121,125 @@ def test_a_hanging_object_that_pixels_need_stays():
     grid = shadow_hull(scene, labels_of(scene), votes=1, nodes=48)
     for ball in pair:
         assert float(grid.sdf(torch.tensor([ball.centre]))) < 0
+
+
+# --- the rim of a tray and the lid of its hull -----------------------------------------------------------------------
+
+
+WALL, SIZE, HIGH, FLOOR = 5.0, 40.0, 30.0, 6.0  # mm
+TRAY = (
+    Box((-SIZE, -SIZE, 0.0), (SIZE, SIZE, FLOOR)),
+    Box((-SIZE, -SIZE, 0.0), (-SIZE + WALL, SIZE, HIGH)),
+    Box((SIZE - WALL, -SIZE, 0.0), (SIZE, SIZE, HIGH)),
+    Box((-SIZE, -SIZE, 0.0), (SIZE, -SIZE + WALL, HIGH)),
+    Box((-SIZE, SIZE - WALL, 0.0), (SIZE, SIZE, HIGH)),
+)
+LID = Box((-SIZE, -SIZE, 0.0), (SIZE, SIZE, HIGH))
+SMEARED = 20.0  # mm: how far behind the wall an integral runs that misses the break at the rim
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """A scene, its truth, the hull with its lid, its exact labels, and lengths of rays: to the hull, to the truth."""
+    scene, truth = render(TRAY, Look(n_lights=16))
+    lidded = render((LID,), Look(n_lights=16))[1]
+    visible, mask = torch.from_numpy(truth.visibility).float(), torch.from_numpy(truth.mask).float()
+    told = torch.from_numpy(truth.normals).float()
+    albedo = torch.zeros(*mask.shape, 3)
+    labels = Labels(visible, torch.ones_like(visible), mask, torch.ones_like(mask), told, mask, albedo)
+    eye = scene.eye.numpy()
+    lengths = (np.where(truth.mask, np.linalg.norm(one.points - eye, axis=-1), np.nan) for one in (lidded, truth))
+    return scene, truth, lidded, grid_of((LID,), 2.0), labels, *lengths
+
+
+@pytest.fixture(scope="module")
+def smeared(seen):
+    """The integral that runs on below the rim; where the hull's matter is: in front of a wall; how alike it is."""
+    _, truth, lidded, *_, lid, true = seen
+    there = np.abs(true - lid) < 1.0
+    return np.where(there, true + SMEARED, true), there, likeness(lidded.normals, truth.normals, truth.mask * 1.0)
+
+
+def test_rays_tell_the_rim_from_the_lid(seen, smeared):
+    scene, truth, _, hull, labels, *_ = seen
+    behind, there, alike = smeared
+    belief = hull_occupancy(hull, scene, labels, behind, 1, alike)
+    right = (belief > 0.5) == there
+    assert right[truth.mask].mean() > 0.9
+    assert belief[there & truth.mask].mean() > 0.8
+    assert belief[~there & truth.mask].mean() < 0.2
+    assert (belief[~truth.mask] == 0.5).all()  # no ray tells
+
+
+def test_the_integral_is_held_where_matter_is_and_breaks_beside_it(seen, smeared):
+    scene, truth, lidded, _, _, lid, true = seen
+    behind, there, _ = smeared
+    along, trust = scene.directions.double().numpy(), truth.mask.astype(float)
+    found = integrate_within(along, lid, lidded.normals, truth.normals, trust, behind, there.astype(float))
+    off = np.abs(found - true)[truth.mask]
+    assert np.median(off) < 1.0
+    assert np.quantile(off, 0.8) < 3.0
+    alone = integrate_within(along, lid, lidded.normals, truth.normals, trust)
+    assert np.abs(alone - true)[truth.mask].mean() > 2 * off.mean()
+
+
+# --- few lights leave the depth of a hull open -----------------------------------------------------------------------
+
+
+SLAB = Box((-45.0, -30.0, 0.0), (45.0, 30.0, 20.0))
+HEAD = Sphere((10.0, 0.0, 12.0), 22.0)
+NODES = 56
+
+
+@pytest.fixture(scope="module")
+def slab_seen():
+    """A scene of two lights, its truth, and the true lengths of its rays (nan beside the object)."""
+    scene, truth = render((SLAB, HEAD), Look(n_lights=2))
+    length = np.linalg.norm(truth.points - scene.eye.numpy(), axis=-1)
+    mask = torch.from_numpy(truth.mask).float()
+    return replace(scene, mask=mask), truth, np.where(truth.mask, length, np.nan)
+
+
+def test_the_hull_is_made_anew_behind_the_front(slab_seen):
+    scene, truth, _ = slab_seen
+    low, spacing = np.array([-60.0, -45.0, -6.0]), 120.0 / (NODES - 1)
+    shape = (NODES, round(90 / spacing) + 1, round(84 / spacing) + 1)
+    nodes = low + spacing * np.moveaxis(np.indices(shape), 0, -1)
+    true = truth.sdf(nodes.reshape(-1, 3)).reshape(shape)
+    stripe = nodes[..., 0] // 8 % 2 > 0
+    speck = np.linalg.norm(nodes - [-40.0, 0.0, 60.0], axis=-1) - 4.0
+    away = truth.points[truth.mask].mean(0) - scene.eye.numpy()
+    back = truth.sdf((nodes - 15 * away / np.linalg.norm(away)).reshape(-1, 3)).reshape(shape)
+    carved, free = np.minimum(np.where(stripe, back, true), speck), true - 8
+    hull, space = (
+        resampled(SdfGrid(torch.from_numpy(x).float(), torch.from_numpy(low).float(), spacing), NODES).grid()
+        for x in (carved, np.minimum(free, speck))
+    )
+    observer = Observer(scene)
+    mask = torch.from_numpy(truth.mask).float()
+    nothing = torch.zeros(len(scene.lights), *mask.shape)
+    told = torch.from_numpy(truth.normals).float()
+    labels = Labels(nothing, nothing, mask, torch.ones_like(mask), told, mask, torch.zeros(*mask.shape, 3))
+    found = on_front(hull, space, scene, observer.seen(hull), observer.seen(space)[0], labels)
+    after = resampled(found, NODES).grid()
+    inner = binary_erosion(truth.mask, iterations=3)
+    off = [np.linalg.norm(observer.seen(g)[0].numpy() - truth.points, axis=-1)[inner] for g in (hull, after)]
+    assert np.std(off[1]) < 0.5 * np.std(off[0])  # what all of it is off by, normals do not say
+    assert float(after.sdf(torch.tensor([[-40.0, 0.0, 60.0]]))) > 0
+
+
+@pytest.mark.parametrize("spoilt", [("on_front",), ("follow_normals",), ("on_front", "follow_normals")])
+def test_a_bend_that_the_shadows_contradict_is_left_for_another_or_for_the_hull(monkeypatch, spoilt):
+    scene, _ = render((BALL,), Look(width=64, height=48, n_lights=5))
+    raised = 1.2 * BALL.radius
+
+    def floats(grid: SdfGrid, *_: object) -> SdfGrid:
+        return SdfGrid(grid.values, grid.origin + torch.tensor([0.0, 0.0, raised]), grid.spacing)
+
+    for name in ("on_front", "follow_normals"):
+        monkeypatch.setattr(bent_hull, name, floats if name in spoilt else lambda grid, *_: grid)
+    monkeypatch.setattr(joint_normals, "STEPS", NORMAL_STEPS)
+    config = FitConfig(levels=(Level(32, 1, (0.5, 0.4), 4),))
+    found = choose_start.HullStart((scene,), (Observer(scene),), config, lambda _: None).surface()
+    low, high = torch.tensor([BALL.centre, BALL.centre]) + torch.tensor([[0.0] * 3, [0.0, 0.0, 1.6 * BALL.radius]])
+    assert float(found.sdf(low[None])) < 0 < float(found.sdf(high[None]))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from dataset_folders import (
+    calibrated,
     from_above,
     loaded,
     places,
@@ -32,8 +33,6 @@ from reconstruct.labels.outline import bright_object
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.run.presets import preset
 from reconstruct.scene import build_scene
-from reconstruct.source.calibrate_source import calibrate_source
-from reconstruct.source.photos import read_photos
 from reconstruct.source.source import RunOptions, open_source
 
 
@@ -43,12 +42,9 @@ def seen_from_above(shapes=(BALL,), side=64, n_lights=12):
 
 
 def scene_of(folder, **options):
-    chosen = RunOptions(**options)
-    source = open_source(folder, chosen)
-    (pictures,) = read_photos(source, chosen)
-    calibration = calibrate_source(source, (pictures,), chosen).first
+    source, (pictures,), calibration = calibrated(folder, **options)
     scene = build_scene(pictures.stack, calibration, 320, pictures.shadow, pictures.mask)
-    return replace(scene, ground_known=source.ground_is_known(chosen))
+    return replace(scene, ground_known=source.ground_is_known(RunOptions(**options)))
 
 
 def start_of(scene):
@@ -222,20 +218,18 @@ def test_import_refuses_a_folder_that_holds_something_and_leaves_it_alone(tmp_pa
     assert [path.name for path in (tmp_path / "ours").iterdir()] == ["note.txt"]
 
 
-def test_a_folder_of_two_layouts_is_called_so(tmp_path):
+def test_a_folder_of_two_layouts_is_called_so_and_a_list_that_is_named_for_the_lights_makes_none(tmp_path):
     truth = seen_from_above(side=32, n_lights=6)
-    write_diligent(tmp_path, truth, np.ones((6, 3)))
-    write_rti(tmp_path, truth)
+    one, both = tmp_path / "one", tmp_path / "both"
+    for folder in (one, both):
+        write_rti(folder, truth)
+    write_diligent(both, truth, np.ones((6, 3)))
     with pytest.raises(CaptureError, match=r"DiLiGenT .* by light_directions.txt .* and RTI .* by assembly-files"):
-        find_importer(tmp_path)
-
-
-def test_a_list_that_is_named_for_the_lights_makes_no_other_layout_either(tmp_path):
-    write_rti(tmp_path, seen_from_above(side=32, n_lights=6))
-    photos = tmp_path / "jpeg-exports"
+        find_importer(both)
+    photos = one / "jpeg-exports"
     (photos / "stone_07.png").write_bytes((photos / "stone_01.png").read_bytes())
-    assert find_importer(tmp_path, tmp_path / "assembly-files" / "stone.lp") is None
-    assert find_importer(tmp_path, tmp_path / "lights.json") is not None
+    assert find_importer(one, one / "assembly-files" / "stone.lp") is None
+    assert find_importer(one, tmp_path / "lights.json") is not None
 
 
 def bare_photos(folder):
@@ -253,10 +247,8 @@ def test_a_list_with_the_light_of_every_photo_needs_no_board(tmp_path, name, is_
     rows = [f"{name};{x};{y};{z}" for name, (x, y, z) in zip(names, towards_lights(truth), strict=True)]
     file = (tmp_path if is_named else capture) / name
     file.write_text("\n".join(["6", *rows]).replace(";", " ") if is_named else "\n".join(["photo;x;y;z", *rows]))
-    options = RunOptions(lights=str(file) if is_named else "auto")
-    source = open_source(capture, options)
-    assert source.known is not None and not source.ground_is_known(options)
-    calibration = calibrate_source(source, read_photos(source, options), options).first
+    source, _, calibration = calibrated(capture, lights=str(file) if is_named else "auto")
+    assert source.known is not None and not source.ground_is_known(RunOptions())
     assert [light.photo for light in calibration.lights] == names
     found = np.array([light.direction for light in calibration.lights])
     np.testing.assert_allclose(found, towards_lights(truth), atol=1e-5)
@@ -306,10 +298,8 @@ def test_a_calibration_of_another_run_brings_camera_and_ground_to_photos_without
     names = [f"stone_{i + 1:02d}.png" for i in range(6)]
     lights = [replace(light, photo=name) for light, name in zip(truth.calibration.lights, names, strict=True)]
     save_calibration(replace(truth.calibration, lights=tuple(lights)), tmp_path / "calibration.json")
-    options = RunOptions(lights=str(tmp_path / "calibration.json"))
-    source = open_source(capture, options)
-    calibration = calibrate_source(source, read_photos(source, options), options).first
-    assert source.ground_is_known(options) and calibration.unit == truth.calibration.unit
+    source, _, calibration = calibrated(capture, lights=str(tmp_path / "calibration.json"))
+    assert source.ground_is_known(RunOptions()) and calibration.unit == truth.calibration.unit
     assert calibration.camera == truth.calibration.camera
 
 
@@ -351,9 +341,7 @@ def test_a_file_of_lights_replaces_those_of_a_scene(tmp_path):
     moved = places(truth) * 0.01 + [0.1, 0, 0.5]
     rows = [{"photo": name, "position": place.tolist()} for name, place in zip(names, moved, strict=True)]
     (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}))
-    options = RunOptions(lights=str(tmp_path / "lights.json"))
-    source = open_source(tmp_path / "scene", options)
-    calibration = calibrate_source(source, read_photos(source, options), options).first
+    calibration = calibrated(tmp_path / "scene", lights=str(tmp_path / "lights.json"))[2]
     np.testing.assert_allclose(np.array([x.position for x in calibration.lights], float), moved)
     powers = np.array([light.power for light in calibration.lights])
     assert np.ptp(powers) == 0 and powers[0, 0] == pytest.approx(6.4, rel=0.5)  # 96 000 mm^2 at 0.01, albedo 0.6 as 0.9

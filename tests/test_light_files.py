@@ -221,41 +221,30 @@ def angles_of(around: str, second: str) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ("head", "columns"),
+    ("head", "columns", "kind", "note"),
     [
-        ("photo,azimuth,elevation", lambda a, e: np.degrees([a, e])),
-        ("photo,az_rad,el_rad", lambda a, e: np.array([a, e])),
-        ("image,phi [deg],theta [deg],gain", lambda a, e: np.array([np.degrees(a), 90 - np.degrees(e), 0 * a])),
-        ("name,Elevation (deg),Azimuth (deg)", lambda a, e: np.degrees([e, a])),
+        ("photo,azimuth,elevation", lambda a, e: np.degrees([a, e]), "directional", "angles in"),
+        ("photo,az_rad,el_rad", lambda a, e: [a, e], "directional", "angles in"),
+        (
+            "image,phi [deg],theta [deg],gain",
+            lambda a, e: [np.degrees(a), 90 - np.degrees(e), 0 * a],
+            "directional",
+            "angles in",
+        ),
+        ("name,Elevation (deg),Azimuth (deg)", lambda a, e: np.degrees([e, a]), "directional", "angles in"),
+        ("photo,x,y,z", lambda *_: directions().T, "point", "as places"),
+        ("photo,x_mm,y_mm,z_mm", lambda *_: directions().T, "point", "as places"),
+        ("photo,pos_x [cm],pos_y [cm],pos_z [cm]", lambda *_: directions().T / 10, "point", "as places"),
+        ("photo,dx,dy,dz", lambda *_: directions().T, "directional", ""),
     ],
 )
-def test_a_table_of_angles_is_read_by_its_head(tmp_path, head, columns):
-    rows = columns(*angles(unit_directions())).T
-    lines = [f"{photo},{','.join(f'{x:.6f}' for x in row)}" for photo, row in zip(PHOTOS, rows, strict=True)]
+def test_a_table_is_read_by_its_head(tmp_path, head, columns, kind, note):
+    rows = np.transpose(columns(*angles(unit_directions())))
+    lines = [f"{photo},{','.join(f'{x:.9f}' for x in row)}" for photo, row in zip(PHOTOS, rows, strict=True)]
     (tmp_path / "a.csv").write_text("\n".join([head, *reversed(lines)]))
     given = read_lights(tmp_path / "a.csv", PHOTOS, POSED_CAMERA)
-    assert_towards_the_lights(given)
-    assert any("angles in" in note for note in given.notes)
-
-
-@pytest.mark.parametrize(
-    ("head", "scale", "kind"),
-    [
-        ("photo,x,y,z", 1.0, "point"),
-        ("photo,x_mm,y_mm,z_mm", 1.0, "point"),
-        ("photo,pos_x [cm],pos_y [cm],pos_z [cm]", 0.1, "point"),
-        ("photo,dx,dy,dz", 1.0, "directional"),
-    ],
-)
-def test_a_table_of_places_is_read_as_places(tmp_path, head, scale, kind):
-    lines = [f"{n},{','.join(f'{x:.5f}' for x in row * scale)}" for n, row in zip(PHOTOS, directions(), strict=True)]
-    (tmp_path / "a.csv").write_text("\n".join([head, *lines]))
-    given = read_lights(tmp_path / "a.csv", PHOTOS, POSED_CAMERA)
-    if kind == "directional":
-        assert_towards_the_lights(given)
-    else:
-        np.testing.assert_allclose(places(given), PLACES, atol=1e-3)
-        assert any("as places" in note for note in given.notes)
+    assert_lights(given, kind)
+    assert not note or any(note in text for text in given.notes)
 
 
 @pytest.mark.parametrize(

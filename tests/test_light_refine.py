@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from dataset_folders import calibrated
 from synthetic import BALL, HEAP, Look, grid_of, render
 from test_known import write_scene
 
@@ -18,8 +19,6 @@ from reconstruct.solve.level import LevelFit
 from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift, unseen_motion
 from reconstruct.solve.ray_operators import cross_entropy
 from reconstruct.solve.trials import judge, try_lights
-from reconstruct.source.calibrate_source import calibrate_source
-from reconstruct.source.photos import read_photos
 from reconstruct.source.source import RunOptions, open_source
 from reconstruct.torch_sdf.ray_field import CompiledRays
 
@@ -91,7 +90,7 @@ def test_a_homology_about_the_eye_keeps_what_is_in_line():
         assert np.linalg.norm(away) < 1e-3 * np.linalg.norm(alone)  # of second order
 
 
-def test_a_known_light_never_moves_and_an_uncertain_one_only_against_its_gradient():
+def test_a_known_light_never_moves_and_an_uncertain_one_against_its_gradient_as_long_as_that_pulls():
     scene, _ = render((BALL,), Look(n_lights=16))
     sigma = torch.full((16, 3), 5.0)
     sigma[0], sigma[2, 2] = 0.0, 0.0
@@ -107,7 +106,11 @@ def test_a_known_light_never_moves_and_an_uncertain_one_only_against_its_gradien
     assert not shift[0].any() and shift[2, 2] == 0
     assert shift[2, 0] < 0 and shift[3, 0] < 0 and shift[3, 2] < 0
     assert np.abs(shift.mean(0)).max() < 0.1 * np.abs(shift).max()  # all together they stay
-    assert np.linalg.norm(lights.shift.shift, axis=1).max() <= 3.0 + 1e-9
+    astray = np.linalg.norm(lights.shift.shift, axis=1).max()
+    assert 1 < astray <= 3.0 + 1e-9
+    for i in range(150):
+        lights.follow(np.zeros((16, 4)), 0.5, FIRST_ITERATION + 20 + i)
+    assert np.linalg.norm(lights.shift.shift, axis=1).max() < 0.1 * astray  # back to where they were calibrated
 
 
 def test_a_direction_stays_a_unit_vector():
@@ -155,26 +158,9 @@ def test_what_chance_may_do_is_not_accepted():
 
 def test_a_stated_light_error_makes_known_lights_uncertain(tmp_path):
     write_scene(tmp_path / "scene", light_type="point")
-    options = RunOptions(light_error=0.03)
-    source = open_source(tmp_path / "scene", options)
-    calibration = calibrate_source(source, read_photos(source, options), options).first
-    for light in calibration.lights:
+    for light in calibrated(tmp_path / "scene", light_error=0.03)[2].lights:
         assert light.position is not None
         distance = np.linalg.norm(light.position)  # the camera looks at the ground 15 mm beside the origin
         assert np.linalg.norm(light.sigma) == pytest.approx(0.03 * distance, rel=0.05)
     with pytest.raises(CaptureError, match="--light-error 3"):
         open_source(tmp_path / "scene", RunOptions(light_error=3.0))
-
-
-def test_lights_that_no_shadow_pulls_any_more_go_back_to_where_they_were_calibrated():
-    scene, _ = render((BALL,), Look(n_lights=16))
-    scene = replace(scene, light_sigma=torch.full((16, 3), 5.0))
-    lights, gradient = MovingLights(scene, no_shift(scene)), np.zeros((16, 4))
-    gradient[[2, 3]] = [1.0, 0.0, 1.0, 2.0]
-    for i in range(30):
-        lights.follow(gradient, 0.5, FIRST_ITERATION + i)
-    astray = np.linalg.norm(lights.shift.shift, axis=1).max()
-    for i in range(150):
-        lights.follow(np.zeros((16, 4)), 0.5, FIRST_ITERATION + 30 + i)
-    assert astray > 1
-    assert np.linalg.norm(lights.shift.shift, axis=1).max() < 0.1 * astray

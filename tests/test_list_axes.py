@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 from dataset_folders import loaded, write_photo
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
-from calibration.scenes.unstated import UPRIGHT, WAYS
+from calibration.scenes.distant_camera import distant_light
+from calibration.scenes.unstated import UPRIGHT, WAYS, read_shading
+from capture.decode.formats import states_curve
 from capture.photos.photo import encode_srgb
 
 SIDE, PHOTOS = 48, 10
@@ -111,3 +114,86 @@ def test_a_list_over_the_stored_pictures_fits_whatever_their_orientation(tmp_pat
 def test_lines_in_another_order_fit_in_no_way(tmp_path, height):
     (sentence,) = warnings_of(write(tmp_path, height, lights()[np.random.default_rng(5).permutation(PHOTOS)]))
     assert "contradicts the listed lights" in sentence and "order" in sentence
+
+
+# --- powers and tone curve that neither list nor files state ---------------------------------------------------------
+
+
+PX, FRAMES = 40, 12
+POWERS = np.random.default_rng(1).permutation(np.geomspace(0.2, 1.0, FRAMES))
+
+
+def sphere_folder(folder, powers, curve, order=None, gloss=(0.0, 1.0)):
+    """Photos of a sphere in the dark, albedo 0.9, and the directional lights that are listed for them.
+
+    gloss: of its highlights, how bright before the matt part and how sharp (Blinn's exponent).
+    """
+    v, u = np.mgrid[:PX, :PX]
+    x, y = (u - PX / 2 + 0.5) / (0.45 * PX), -(v - PX / 2 + 0.5) / (0.45 * PX)
+    inside = x**2 + y**2 < 1
+    normals = np.stack([x, y, np.sqrt(np.clip(1 - x**2 - y**2, 0, 1))], -1) * inside[..., None]
+    azimuth, height = np.arange(FRAMES) * 2.4, np.linspace(0.55, 1.4, FRAMES)
+    towards = np.stack([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)], -1)
+    photos = [folder / f"{i:02d}.png" for i in range(FRAMES)]
+    for path, light, power in zip(photos, towards, powers, strict=True):
+        half = light + np.array([0, 0, 1])
+        half /= np.linalg.norm(half)
+        mirrored = gloss[0] * np.clip(normals @ half, 0, None) ** gloss[1] * (normals @ light > 0)
+        grey = 0.9 * power * (np.clip(normals @ light, 0, None) + mirrored) / (1 + gloss[0])
+        write_photo(path, np.repeat(grey[..., None], 3, -1), curve)
+    listed = towards if order is None else towards[order]
+    return photos, [distant_light(path.name, light) for path, light in zip(photos, listed, strict=True)]
+
+
+def log_errors(shading, powers):
+    logs = np.log([light.power.mean() for light in shading.lights]) - np.log(powers)
+    return np.abs(logs - logs.mean())
+
+
+@pytest.mark.parametrize("curve", ["sRGB", "linear8", "linear16"])
+def test_powers_of_one_to_five_and_the_curve_are_read_from_shading(tmp_path, curve):
+    photos, lights = sphere_folder(tmp_path, POWERS, curve)
+    shading = read_shading(photos, lights, None, False)
+    assert shading.is_linear == (curve != "sRGB")
+    assert log_errors(shading, POWERS).max() < 0.05
+    assert any("5.0 times" in note for note in shading.notes) and any("tone curve" in note for note in shading.notes)
+
+
+@pytest.mark.parametrize(
+    ("curve", "has_power", "gloss"),
+    [("sRGB", True, (0.3, 20)), ("linear8", False, (1, 20)), ("sRGB", False, (4, 100)), ("linear8", True, (4, 400))],
+)
+def test_gloss_makes_no_other_curve(tmp_path, curve, has_power, gloss):
+    photos, lights = sphere_folder(tmp_path, np.ones(FRAMES), curve, gloss=gloss)
+    assert read_shading(photos, lights, None, has_power).is_linear == (curve == "linear8")
+
+
+@pytest.mark.parametrize("curve", ["sRGB", "linear16"])
+def test_equal_powers_stay_equal(tmp_path, curve):
+    photos, lights = sphere_folder(tmp_path, np.ones(FRAMES), curve)
+    shading = read_shading(photos, lights, None, False)
+    assert shading.is_linear == (curve != "sRGB") and list(shading.lights) == lights
+
+
+def test_powers_that_are_listed_stay_and_so_does_a_stated_curve(tmp_path):
+    photos, lights = sphere_folder(tmp_path, POWERS, "linear16")
+    shading = read_shading(photos, lights, False, True)
+    assert not shading.is_linear and list(shading.lights) == lights and shading.notes == ()
+
+
+def test_a_list_in_wrong_order_gives_no_powers(tmp_path):
+    photos, lights = sphere_folder(tmp_path, np.ones(FRAMES), "sRGB", np.roll(np.arange(FRAMES), 5))
+    shading = read_shading(photos, lights, False, False)
+    assert list(shading.lights) == lights
+
+
+def test_formats_for_display_and_files_with_a_profile_state_their_curve(tmp_path):
+    grey = Image.new("RGB", (8, 8), (90, 90, 90))
+    told = PngInfo()
+    told.add(b"gAMA", (45455).to_bytes(4, "big"))
+    grey.save(tmp_path / "gamma.png", pnginfo=told)
+    grey.save(tmp_path / "photo.jpg")
+    grey.save(tmp_path / "bare.png")
+    grey.save(tmp_path / "bare.tif")
+    found = {name: states_curve(tmp_path / name) for name in ("gamma.png", "photo.jpg", "bare.png", "bare.tif")}
+    assert found == {"gamma.png": True, "photo.jpg": True, "bare.png": False, "bare.tif": False}

@@ -5,15 +5,7 @@ import math
 import pytest
 import torch
 
-from reconstruct.appearance.brdf import (
-    LOBES,
-    MATERIALS,
-    Material,
-    conserving,
-    metal_rough,
-    reflectance,
-    specular,
-)
+from reconstruct.appearance.brdf import LOBES, MATERIALS, Material, conserving, metal_rough, reflectance, specular
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 

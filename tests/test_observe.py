@@ -10,6 +10,7 @@ from synthetic import BALL, HEAP, Box, Look, default_lights, render
 
 from reconstruct.labels import ground_test as ground_module
 from reconstruct.labels.labels import assemble_labels, not_isolated
+from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.scene import Scene
 
@@ -219,3 +220,19 @@ def test_what_is_dark_where_no_shadow_of_the_object_may_fall_is_no_shadow():
     assert not said.any()
     kept = (truth.visibility < 0.5) & ~truth.mask & ~beyond
     assert (found.confidence.numpy()[kept] > 0).mean() > 0.9
+
+
+# --- coverage of outline pixels --------------------------------------------------------------------------------------
+
+
+def test_edge_pixels_are_unmixed_to_their_coverage_and_an_outline_drawn_a_pixel_too_wide_moves_back():
+    """A square whose right column is covered by 0.3."""
+    covered = torch.zeros(30, 30)
+    covered[8:22, 8:21] = 1
+    covered[8:22, 21] = 0.3
+    inside, outside = torch.tensor(np.random.default_rng(1).random((2, 12, 1, 1)), dtype=torch.float32)
+    photos = (inside * covered + outside * (1 - covered))[..., None]
+    mask = coverage_at_edges(photos, covered > 0.5)
+    assert torch.allclose(mask[12:18], covered[12:18], atol=1e-4)
+    wide = torch.nn.functional.max_pool2d((covered > 0.5).float()[None], 3, 1, 1)[0] > 0
+    assert torch.equal(coverage_at_edges(photos, wide)[12:18] > 0.5, covered[12:18] > 0.5)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from ball_shadows import EYE, HEIGHT, MIDDLE, RADIUS, WIDTH, ball_camera, drawn, hits_ball, photographed
+from ball_shadows import EYE, HEIGHT, MIDDLE, RADIUS, WIDTH, ball_camera, ball_lights, drawn, hits_ball, photographed
 from flashlight_photos import looking_at
 
 from calibration.flashlight.outline_lights import OUTLINES_WRONG
@@ -29,10 +29,15 @@ def ball():
     return drawn()
 
 
+def terms_of(maps, *spots) -> OutlineTerms:
+    """The terms of all photos' outlines."""
+    every = np.ones(len(ball_lights()), bool)
+    return OutlineTerms(maps, EYE, 0.0, every, every, *spots)
+
+
 def test_right_lights_agree_and_wrong_ones_contradict(ball):
     _, lights, maps = ball
-    every = np.ones(len(lights), bool)
-    terms = OutlineTerms(maps, EYE, 0.0, every, every)
+    terms = terms_of(maps)
     assert np.median(terms.misfit(lights)) < 0.3
     moved = lights.copy()
     moved[3] += [60.0, -40.0, 0.0]  # about 8 degrees
@@ -41,11 +46,10 @@ def test_right_lights_agree_and_wrong_ones_contradict(ball):
 
 def test_a_photo_in_which_no_shadow_is_found_empties_no_space(ball):
     _, lights, maps = ball
-    every, others = np.ones(len(lights), bool), maps.owner != 3
+    others = maps.owner != 3
     fields = np.where(np.arange(len(maps.fields))[:, None, None] == 3, np.abs(maps.fields), maps.fields)
     parts = {name: getattr(maps, name)[others] for name in ("starts", "owner", "first_height")}
-    terms = OutlineTerms(replace(maps, fields=fields, **parts), EYE, 0.0, every, every)
-    assert np.median(terms.misfit(lights)) < 0.3
+    assert np.median(terms_of(replace(maps, fields=fields, **parts)).misfit(lights)) < 0.3
 
 
 def test_derivatives_are_those_of_differences(ball):
@@ -192,10 +196,8 @@ def test_matt_tables_show_no_highlights(ball):
 
 def test_rows_are_derivatives_of_the_highlights_cost(ball):
     _, lights, maps = ball
-    every = np.ones(len(lights), bool)
     points = np.array([[40.0, 60.0, 0.0], [-80.0, 10.0, 0.0]])
-    spots = MirrorHighlights(np.array([2, 5]), points, np.array([0.02, 0.03]))
-    terms = OutlineTerms(maps, EYE, 0.0, every, every, spots)
+    terms = terms_of(maps, MirrorHighlights(np.array([2, 5]), points, np.array([0.02, 0.03])))
     miss, slope, owner = terms._half_vectors(lights)
     assert owner.tolist() == [2, 5]
     step = np.array([0.02, -0.03, 0.01])
@@ -229,10 +231,9 @@ def test_a_part_that_is_lit_as_the_ground_is_makes_right_lights_contradict_unles
     likelihood = np.where(inside, -1.0, shadows.likelihood).astype(np.float32)
     wrong = replace(shadows, visibility=np.where(inside, np.float32(1), shadows.visibility), likelihood=likelihood)
     wrong = replace(wrong, object_mask=shadows.object_mask & ~inside)
-    every = np.ones(len(lights), bool)
     tight, wide = (outline_maps(field, wrong, camera, unknown) for unknown in (False, True))
     assert tight is not None and wide is not None
-    misfit = [OutlineTerms(maps, EYE, 0.0, every, every).misfit(lights) for maps in (tight, wide)]
+    misfit = [terms_of(maps).misfit(lights) for maps in (tight, wide)]
     assert (misfit[0] > DROP_OUTLINE).mean() > OUTLINES_WRONG
     assert np.median(misfit[1]) < 0.3 and (misfit[1] < DROP_OUTLINE).all()
 
@@ -250,11 +251,6 @@ def _moved_together(lights: np.ndarray, m: float) -> np.ndarray:
     return (lights + share * EYE) / (1 + share)
 
 
-def _cost(maps, lights) -> float:
-    every = np.ones(len(lights), bool)
-    return OutlineTerms(maps, EYE, 0.0, every, every).cost(lights)
-
-
 @pytest.mark.parametrize(
     ("cues", "shares"),
     [
@@ -267,5 +263,5 @@ def test_a_photo_from_the_side_and_a_height_fix_the_scale_that_shadows_leave_fre
     held = with_cues(maps, cues, camera)
     for share in shares:
         moved = _moved_together(lights, share / EYE[2])
-        free = _cost(maps, moved) - _cost(maps, lights)
-        assert _cost(held, moved) - _cost(held, lights) > free + 2.0
+        free = terms_of(maps).cost(moved) - terms_of(maps).cost(lights)
+        assert terms_of(held).cost(moved) - terms_of(held).cost(lights) > free + 2.0

@@ -38,27 +38,19 @@ def wheel_names(tmp_path_factory) -> list[str]:
     return zipfile.ZipFile(next((copy / "dist").glob("*.whl"))).namelist()
 
 
-def test_the_wheel_brings_exactly_five_import_names(wheel_names):
+def test_the_wheel_brings_exactly_five_import_names_that_are_typed_and_the_example_of_the_studio(wheel_names):
     tops = {name.split("/")[0] for name in wheel_names if ".dist-info" not in name and ".data/" not in name}
     assert tops == {"capture", "calibration", "reconstruct", "viewer", "shadowgraph"}
-
-
-def test_every_package_tells_type_checkers_that_it_is_typed(wheel_names):
-    assert {n for n in wheel_names if n.endswith("py.typed")} == {
-        f"{p}/py.typed" for p in ("capture", "calibration", "reconstruct", "viewer", "shadowgraph")
-    }
+    assert {n for n in wheel_names if n.endswith("py.typed")} == {f"{p}/py.typed" for p in tops}
+    there = {path.name for path in (ROOT / "examples" / "spot").rglob("*") if path.is_file()}
+    assert {Path(n).name for n in wheel_names if "/share/shadowgraph/examples/spot/" in n} == there
+    assert f"viewer/studio/{EXAMPLE_RESULT.name}" in wheel_names
 
 
 @pytest.mark.parametrize("folder", ["viewer/stage/assets", "viewer/studio_server/web"])
 def test_the_wheel_brings_the_parts_of_the_pages(wheel_names, folder):
     there = {f"{folder}/{path.name}" for path in (ROOT / folder).iterdir()}
     assert len(there) > 3 and {n for n in wheel_names if n.startswith(f"{folder}/")} == there
-
-
-def test_the_wheel_brings_the_example_of_the_studio(wheel_names):
-    there = {path.name for path in (ROOT / "examples" / "spot").rglob("*") if path.is_file()}
-    assert {Path(n).name for n in wheel_names if "/share/shadowgraph/examples/spot/" in n} == there
-    assert f"viewer/studio/{EXAMPLE_RESULT.name}" in wheel_names
 
 
 def test_each_command_of_the_readme_works_alone_in_a_fresh_clone():

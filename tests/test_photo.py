@@ -1,5 +1,6 @@
 import contextlib
 import io
+import json
 import struct
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from capture.decode.formats import decode, read_size
 from capture.decode.heif import container_transfer
 from capture.decode.limits import check_size
 from capture.errors import CaptureError
+from capture.photos import photo
 from capture.photos.photo import (
     decode_srgb,
     encode_srgb,
@@ -26,6 +28,7 @@ from capture.photos.photo import (
     reduced,
     write_picture,
 )
+from capture.photos.store import CLIPPED, COLOURS, LIST
 
 pillow_heif.register_heif_opener()
 FORMATS = {".jpg": "JPEG", ".png": "PNG", ".tif": "TIFF", ".heic": "HEIF", ".avif": "AVIF"}
@@ -175,13 +178,10 @@ def test_a_truncated_photo_is_refused_by_name(tmp_path, suffix):
         read_photo(path)
 
 
-def test_a_jpeg_under_the_name_of_a_raw_file_is_refused(tmp_path):
+def test_a_jpeg_under_the_name_of_a_raw_file_and_a_header_that_claims_a_gigapixel_are_refused(tmp_path):
     path = save(tmp_path / "a.jpg", picture()).rename(tmp_path / "a.nef")
     with pytest.raises(CaptureError, match="JPEG data under the name of a RAW file"):
         read_photo(path)
-
-
-def test_a_header_that_claims_a_gigapixel_is_refused_before_decoding(tmp_path):
     with pytest.raises(CaptureError, match="200 megapixels"):
         check_size(tmp_path / "huge.png", 40000, 40000)
 
@@ -245,3 +245,71 @@ def test_a_thumbnail_keeps_the_sensors_frame_and_brightness(tmp_path):
     small = read_thumbnail(path, 64)
     assert small.shape == (48, 64, 3)
     assert np.abs(small.astype(float) - picture()).mean() < 4
+
+
+# --- reduced photos that are kept on disk ----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def paths(tmp_path):
+    rng = np.random.default_rng(0)
+    files = []
+    for number in range(5):
+        files.append(tmp_path / f"{number}.png")
+        exif = Image.Exif()
+        exif[33434], exif[34855] = 0.01 * (1 + (number == 2)), 100  # the third one is exposed twice as long
+        Image.fromarray(rng.integers(0, 256, (12, 16, 3), dtype=np.uint8)).save(files[-1], exif=exif)
+    return files
+
+
+def read_again(paths, kept, monkeypatch, side=8):
+    """The stack, and the names of the photos that were opened for it."""
+    opened, real = [], photo.read_photo
+    monkeypatch.setattr(photo, "read_photo", lambda path, *rest: (opened.append(path.name), real(path, *rest))[1])
+    stack = read_stack(paths, side, kept=kept)
+    monkeypatch.setattr(photo, "read_photo", real)
+    return stack, sorted(opened)
+
+
+def test_a_stack_on_disk_is_that_in_memory_bit_for_bit_and_is_not_read_twice(paths, tmp_path, monkeypatch):
+    plain = read_stack(paths, 8)
+    assert plain.gains[2] == 2
+    for expected in ([path.name for path in paths], []):
+        stack, opened = read_again(paths, tmp_path / "kept", monkeypatch)
+        assert opened == expected
+        assert np.array_equal(stack.rgb, plain.rgb) and np.array_equal(stack.clipped, plain.clipped)
+        assert (stack.gains, stack.reference, stack.full_width) == (plain.gains, plain.reference, plain.full_width)
+        stack.rgb[:] = 0  # what a reader does to its copy does not reach the files
+
+
+def test_photos_that_were_not_finished_or_are_damaged_are_read_again_and_only_these(paths, tmp_path, monkeypatch):
+    kept = tmp_path / "kept"
+    plain, _ = read_again(paths, kept, monkeypatch)
+    lines = (kept / LIST).read_text().splitlines()
+    order = [json.loads(line)["index"] for line in lines[1:]]
+    (kept / LIST).write_text("\n".join(lines[:-1]) + "\n" + lines[-1][:20])  # killed while the last line was written
+    with (kept / COLOURS).open("r+b") as file:
+        file.seek(order[0] * 12 * 48)
+        file.write(b"\xff")
+    with (kept / CLIPPED).open("r+b") as file:
+        file.seek(order[1] * 48)
+        file.write(b"\x07")
+    stack, opened = read_again(paths, kept, monkeypatch)
+    assert opened == sorted(paths[i].name for i in (order[0], order[1], order[-1]))
+    assert np.array_equal(stack.rgb, plain.rgb) and np.array_equal(stack.clipped, plain.clipped)
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"[]\n[]\n", b'{"format": 1}\n{"index": 7}\n', b"[" * 9999])
+def test_a_list_that_is_none_starts_anew(paths, tmp_path, monkeypatch, content):
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    (kept / LIST).write_bytes(content)
+    stack, opened = read_again(paths, kept, monkeypatch)
+    assert len(opened) == len(paths) and np.array_equal(stack.rgb, read_stack(paths, 8).rgb)
+
+
+def test_photos_of_another_size_are_refused_by_name_in_memory_and_on_disk(paths, tmp_path):
+    Image.new("RGB", (20, 10)).save(paths[3])
+    for kept in (None, tmp_path / "kept", tmp_path / "kept"):
+        with pytest.raises(CaptureError, match=r"1 of 5 photos .* 3\.png \(20 x 10\)"):
+            read_stack(paths, 8, kept=kept)

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -20,12 +21,7 @@ from reconstruct.check.readiness import judge, refuse_hopeless
 from reconstruct.check.verdict import CaptureCheck
 from reconstruct.source.photos import Photos
 from reconstruct.source.source import RunOptions, Source
-from viewer.report.check_page import (
-    PAGE,
-    check_lines,
-    shadow_picture,
-    write_check,
-)
+from viewer.report.check_page import PAGE, check_lines, shadow_picture, write_check
 
 
 @pytest.fixture(scope="module")
@@ -189,25 +185,15 @@ def test_the_command_leaves_page_and_json_and_refuses_the_hopeless(truth, cover,
     assert ("4 are needed at least" in said.err) is (n_used == 2)
 
 
-def test_photos_without_any_usable_light_are_refused_with_the_first_reasons(truth, monkeypatch):
+def test_photos_without_any_usable_light_and_a_failed_calibration_say_what_is_wrong_with_the_photos(truth, monkeypatch):
     unused = tuple(replace(x, used=False, reason="camera moved: 9 px") for x in truth.calibration.lights)
-    pictures = Photos(truth.stack)
-    monkeypatch.setattr(readiness, "read_photos", lambda source, options: (pictures,))
-    monkeypatch.setattr(
-        readiness, "calibrate_source", lambda *_: CalibratedViews.of(replace(truth.calibration, lights=unused))
-    )
-    with pytest.raises(CalibrationError, match=r"0 of 26 photos in heap have a usable light, .*: camera moved: 9 px"):
-        readiness.read_and_check(Source(Path("heap")), RunOptions())
-
-
-def test_a_failed_calibration_also_says_what_is_wrong_with_the_photos(truth, monkeypatch):
-    finding = Finding(Path("IMG_3.jpg"), "blurred", "shaken", 0.4, 0.8, True)
-
-    def fail(source, pictures, options):
-        raise CalibrationError("no board found.")
-
-    pictures = Photos(truth.stack, (finding,))
-    monkeypatch.setattr(readiness, "read_photos", lambda source, options: (pictures,))
-    monkeypatch.setattr(readiness, "calibrate_source", fail)
-    with pytest.raises(CalibrationError, match=r"no board found\. Besides: IMG_3\.jpg: blurred\."):
-        readiness.read_and_check(Source(Path("heap")), RunOptions())
+    blurred = Finding(Path("IMG_3.jpg"), "blurred", "shaken", 0.4, 0.8, True)
+    views = CalibratedViews.of(replace(truth.calibration, lights=unused))
+    for findings, result, said in (
+        ((), [views], r"0 of 26 photos in heap have a usable light, .*: camera moved: 9 px"),
+        ((blurred,), CalibrationError("no board found."), r"no board found\. Besides: IMG_3\.jpg: blurred\."),
+    ):
+        monkeypatch.setattr(readiness, "read_photos", lambda *_, found=findings: (Photos(truth.stack, found),))
+        monkeypatch.setattr(readiness, "calibrate_source", Mock(side_effect=result))
+        with pytest.raises(CalibrationError, match=said):
+            readiness.read_and_check(Source(Path("heap")), RunOptions())

@@ -126,15 +126,12 @@ def test_a_depth_map_of_another_size_or_without_ground_is_refused(tmp_path):
         read_ground_depth(path, truth.calibration.camera)
 
 
-def test_a_trained_field_refuses_uneven_ground(tmp_path):
+def test_a_trained_field_and_photos_of_an_uncalibrated_session_refuse_uneven_ground(tmp_path, monkeypatch):
     write_scene(tmp_path, light_type="point")
     write_floor(tmp_path, np.full((44, 60), 500.0))
     with pytest.raises(CaptureError, match="is held to a plane"):
         open_source(tmp_path, RunOptions(field="neural"))
-
-
-def test_photos_of_an_uncalibrated_session_refuse_uneven_ground(tmp_path, monkeypatch):
-    write_floor(tmp_path, np.full((44, 60), 500.0))
+    (tmp_path / "transforms_train.json").unlink()
     monkeypatch.setattr("reconstruct.source.source.load_capture", lambda folder: None)
     with pytest.raises(CaptureError, match="needs a scene with its own camera and lights"):
         open_source(tmp_path, RunOptions())

@@ -1,12 +1,16 @@
 """Truth: the renderer's own picture under the same light, and shadows whose place is known."""
 
+import struct
+
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 
 import shadowgraph
-from capture.decode.exr import read_exr, write_exr
+from capture.decode.exr import LARGEST_FILE, read_exr, read_panorama, write_exr
+from capture.errors import CaptureError
 from capture.photos.photo import encode_srgb
 from reconstruct.render.g_buffer import look
 from reconstruct.render.relight import relight
@@ -92,3 +96,74 @@ def test_what_cannot_be_made_is_refused_in_one_sentence(run, tmp_path, monkeypat
     assert shadowgraph.main(["relight", str(run), *arguments]) == 2
     error = capsys.readouterr().err
     assert words in error and "Traceback" not in error
+
+
+# --- environment maps from anywhere ----------------------------------------------------------------------------------
+
+
+def ramp(rows: int = 8, columns: int = 16) -> np.ndarray:
+    return np.linspace(0.1, 9.0, rows * columns * 3, dtype=np.float32).reshape(rows, columns, 3)
+
+
+def hdr(picture: np.ndarray) -> bytes:
+    return cv2.imencode(".hdr", np.ascontiguousarray(picture[..., ::-1]))[1].tobytes()
+
+
+def exr(folder, picture: np.ndarray, **more: np.ndarray) -> bytes:
+    path = folder / "map.exr"
+    channels = {name: np.ascontiguousarray(picture[..., i]) for i, name in enumerate("RGB")} | more
+    OpenEXR.File({"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}, channels).write(str(path))
+    return path.read_bytes()
+
+
+def test_both_kinds_are_read_as_linear_light_and_told_apart_by_content(tmp_path):
+    np.testing.assert_allclose(read_panorama(hdr(ramp()), "a.exr")[:, ::-1], ramp(), rtol=0.02)  # 8-bit mantissas
+    np.testing.assert_allclose(read_panorama(exr(tmp_path, ramp()), "a.hdr")[:, ::-1], ramp(), rtol=1e-6)
+
+
+def test_turning_right_in_a_panorama_is_turning_clockwise_as_seen_from_above(tmp_path):
+    picture = np.zeros((8, 16, 3), np.float32)
+    picture[3, 5] = 1.0  # right of column 4
+    assert read_panorama(exr(tmp_path, picture), "x")[3, 16 - 1 - 5].min() == 1.0
+
+
+@pytest.mark.parametrize(
+    ("data", "word"),
+    [
+        (b"", "neither"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(100), "neither"),
+        (b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n", "no size"),
+        (b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 4096 +X 8192\n", "8192 x 4096"),
+        (b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 9999999 +X 9999999\n", "at most"),
+        (b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 512 +X 512\n", "twice as wide"),
+        (b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 4\n", "twice as wide"),
+        (b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8 +X 16\n\x02\x02", "cut off"),
+        (b"\x76\x2f\x31\x01\x02\x00\x00\x00" + bytes(50), "not a readable"),
+    ],
+)
+def test_what_is_no_whole_map_of_a_sphere_is_refused_by_what_is_wrong_with_it(data, word):
+    with pytest.raises(CaptureError, match=word):
+        read_panorama(data, "sky")
+
+
+def test_a_file_cut_off_anywhere_is_refused_or_read_but_never_a_fault(tmp_path):
+    for data in (hdr(ramp(16, 32)), exr(tmp_path, ramp())):
+        for length in range(0, len(data) - 1, max(1, len(data) // 25)):
+            with pytest.raises(CaptureError):
+                read_panorama(data[:length], "sky")
+
+
+def test_a_map_too_large_of_many_channels_or_with_an_infinite_sun_is_refused(tmp_path):
+    huge, sun = exr(tmp_path, ramp()), ramp()
+    window = struct.pack("<4i", 0, 0, 15, 7)
+    assert huge.count(window) == 2  # display and data window
+    sun[2, 3] = np.inf
+    more = {f"layer{i}.R": np.ascontiguousarray(ramp()[..., 0]) for i in range(8)}
+    for data, said in (
+        (huge.replace(window, struct.pack("<4i", 0, 0, 59999, 29999)), "60000 x 30000"),  # before it is decoded
+        (exr(tmp_path, ramp(), **more), "11 channels"),
+        (exr(tmp_path, sun), "1 pixels are infinite"),
+        (b"#?" + bytes(LARGEST_FILE), "MB"),  # unread
+    ):
+        with pytest.raises(CaptureError, match=said):
+            read_panorama(data, "sky")

@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from fake_run import start_run
 
+import shadowgraph
 from calibration.calibration import save_calibration
+from capture.errors import ReconstructionError, UserError
 from capture.photos.photo import encode_srgb
 from reconstruct.check.light_coverage import widest_gap
 from reconstruct.run_folder.folder import RunFolder
 from reconstruct.sdf.grid import SdfGrid
+from shadowgraph.run_result import RunResult
 from viewer.report.document import difference_picture, mesh_picture, normal_picture, reduced
 from viewer.report.figures import curves, lights_from_above
 from viewer.report.numbers import refinement_part
@@ -97,13 +101,6 @@ def test_the_report_asks_no_server_for_anything(whole_page):
     assert "default-src 'none'" in whole_page
 
 
-def test_a_run_that_stopped_early_says_where_and_why(tmp_path, truth):
-    fake_run.start_run(tmp_path, truth)
-    assert "There is no mesh. Stopped while fitting the surface." in Reader(page_of(tmp_path)).text
-    (tmp_path / "report.json").write_text(json.dumps({"error": "board found in 0 of 4 photos"}))
-    assert "The run stopped: board found in 0 of 4 photos" in Reader(page_of(tmp_path)).text
-
-
 def test_a_run_that_stopped_early_says_what_its_finished_stages_cost(tmp_path, truth):
     fake_run.start_run(tmp_path, truth)
     with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path) as run:
@@ -114,8 +111,12 @@ def test_a_run_that_stopped_early_says_what_its_finished_stages_cost(tmp_path, t
     assert "Finding camera and lights" in Reader(page_of(tmp_path)).text
 
 
-def test_an_empty_folder_gets_a_report_too(tmp_path):
+def test_an_empty_folder_gets_a_report_and_a_run_that_stopped_early_says_where_and_why(tmp_path, truth):
     assert "There is no mesh" in Reader(page_of(tmp_path)).text
+    fake_run.start_run(tmp_path, truth)
+    assert "There is no mesh. Stopped while fitting the surface." in Reader(page_of(tmp_path)).text
+    (tmp_path / "report.json").write_text(json.dumps({"error": "board found in 0 of 4 photos"}))
+    assert "The run stopped: board found in 0 of 4 photos" in Reader(page_of(tmp_path)).text
 
 
 @pytest.mark.parametrize("name", ["calibration.json", "normal.npy"])
@@ -154,22 +155,15 @@ def test_the_nearer_surface_hides_the_farther_one():
     assert picture[50, 80, 2] > 100 and picture[50, 80, 0] == 0
 
 
-def test_a_normal_towards_the_sky_is_blue():
-    picture = normal_picture(np.array([[[0.0, 0.0, 1.0]]]), np.array([[True]]))
-    assert picture[0, 0].tolist() == [128, 128, 255, 255]
-
-
-def test_a_brighter_photo_is_red_a_darker_one_blue_and_an_equal_one_grey():
-    photo = np.full((1, 3, 3), 100, np.uint8)
+def test_pictures_have_their_colours_and_are_made_smaller_and_never_larger():
+    """A normal towards the sky is blue; a brighter photo is red, a darker one blue and an equal one grey."""
+    assert normal_picture(np.array([[[0.0, 0.0, 1.0]]]), np.array([[True]]))[0, 0].tolist() == [128, 128, 255, 255]
     computed = np.array([[[40] * 3, [160] * 3, [100] * 3]], np.uint8)
-    red, blue, grey = difference_picture(photo, computed)[0].astype(int)
-    assert red[0] > red[2] + 100 and blue[2] > blue[0] + 100
-    assert np.ptp(grey) == 0
-
-
-def test_pictures_are_made_smaller_and_never_larger():
-    assert reduced(np.zeros((300, 400, 3), np.uint8), 100).shape == (75, 100, 3)
-    assert reduced(np.zeros((30, 40, 3), np.uint8), 100).shape == (30, 40, 3)
+    red, blue, grey = difference_picture(np.full((1, 3, 3), 100, np.uint8), computed)[0].astype(int)
+    assert red[0] > red[2] + 100 and blue[2] > blue[0] + 100 and np.ptp(grey) == 0
+    for height, smaller in ((300, 75), (30, 30)):
+        picture = np.zeros((height, 4 * height // 3, 3), np.uint8)
+        assert reduced(picture, 100).shape == (smaller, 4 * smaller // 3, 3)
 
 
 def gap(one: np.ndarray, other: np.ndarray) -> float:
@@ -203,14 +197,11 @@ def ring(truth, degrees, used=None):
     return replace(truth.calibration, lights=lights)
 
 
-def test_the_widest_gap_is_where_no_light_came_from_also_across_the_x_axis(truth):
+def test_the_widest_gap_is_where_no_light_that_was_used_came_from_also_across_the_x_axis(truth):
     start, gap = widest_gap(ring(truth, [40, 100, 200, 320]), np.zeros(3))
     assert np.degrees([start, gap]) == pytest.approx([-160, 120])
     start, gap = widest_gap(ring(truth, [30, 60, 90, 300]), np.zeros(3))
     assert np.degrees([start, gap]) == pytest.approx([90, 210])
-
-
-def test_a_light_that_was_not_used_covers_nothing(truth):
     everywhere = [0, 60, 120, 180, 240, 300]
     _, gap = widest_gap(ring(truth, everywhere, [True, True, True, False, True, True]), np.zeros(3))
     assert np.degrees(gap) == pytest.approx(120)
@@ -256,3 +247,48 @@ def test_the_report_tells_how_far_lights_moved_and_why_that_was_kept():
     page = refinement_part({"refined_lights": [{"sigmas": by} for by in (1, 2, 3, 4)], "light_trial": trial})
     assert "Refined lights decided upon." in page and "less than 2.50 times" in page
     assert "times" not in refinement_part({"light_trial": trial | {"accepted": False}})
+
+
+# --- a finished run as a Python object -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def folder(finished_run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    return finished_run(folder).rename(folder / "two <balls>")
+
+
+def test_a_result_gives_mesh_maps_calibration_and_report(folder):
+    result = RunResult(folder)
+    assert result.unit == "mm"
+    assert result.mesh.is_watertight
+    assert result.depth.shape == result.normals.shape[:2] == result.mask.shape
+    assert np.isfinite(result.depth[result.mask]).all()
+    assert len(result.calibration.lights) == 6
+    assert result.warnings == ["The lights cover only half of the sky; the far side is a guess."]
+    assert "faces" in repr(result)
+    assert repr(result.calibration) == "Calibration(96 x 72 px, 5 of 6 lights used, unit 'mm')"
+    assert re.fullmatch(r"SolvedScene\(\d+ x \d+ x \d+ nodes of [\d.]+ mm, matt\)", repr(result.fields))
+
+
+def test_a_notebook_shows_a_card_in_which_names_are_only_text(folder):
+    card = RunResult(folder)._repr_html_()
+    assert "two &lt;balls&gt;" in card
+    assert "5 of 6 photos used" in card
+    assert "data:image/png" in card
+
+
+def test_a_run_that_is_not_finished_says_what_is_missing(tmp_path, truth):
+    start_run(tmp_path / "run", truth)
+    with pytest.raises(ReconstructionError, match=r"fields\.safetensors, mesh\.ply, report\.json"):
+        RunResult(tmp_path / "run")
+
+
+def test_the_call_refuses_what_the_command_refuses(tmp_path):
+    with pytest.raises(UserError, match="preset='fast': one of 'draft', 'standard'"):
+        shadowgraph.run(tmp_path, preset="fast")
+    with pytest.raises(UserError, match="photos"):
+        shadowgraph.run(tmp_path, tmp_path / "out", quiet=True)
+    with pytest.raises(TypeError, match=r"no setting 'colour'; .*preset.* are known"):
+        shadowgraph.run(tmp_path, colour="red")
+    assert not (tmp_path / "out").exists()

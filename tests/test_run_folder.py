@@ -32,32 +32,32 @@ def test_a_number_that_is_not_one_is_refused_in_json(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_failing_run_leaves_no_folder_where_there_was_none(tmp_path):
-    with pytest.raises(UserError), RunFolder(tmp_path / "out") as run:
+@pytest.mark.parametrize("there", [None, "notes.txt", "manifest.json"])
+def test_a_failing_run_leaves_what_was_there_and_no_lock(tmp_path, there):
+    folder = tmp_path / "out"
+    if there:
+        folder.mkdir()
+        (folder / there).write_text("mine")
+    said = r"manifest\.json" if there == "manifest.json" else "nothing here"
+    with pytest.raises(UserError, match=said), RunFolder(folder) as run:
         run.progress(message="looking")
-        raise UserError("nothing here")
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_failing_run_leaves_what_others_put_into_its_folder(tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(UserError), RunFolder(tmp_path) as run:
         run.write_json("calibration.json", {})
         raise UserError("nothing here")
-    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
-
-
-def test_a_folder_refused_for_its_manifest_is_not_left_locked(tmp_path):
-    (tmp_path / "manifest.json").write_text("something else")
-    with pytest.raises(UserError, match=r"manifest\.json"), RunFolder(tmp_path):
-        pass
-    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
+    assert [path.name for path in tmp_path.rglob("*.*")] == ([there] if there else []) and folder.exists() == bool(
+        there
+    )
 
 
 @pytest.mark.parametrize(
     "content",
-    ["", "{}", '{"pid": 4194304999, "started": 0}', f'{{"pid": {os.getpid()}, "started": 5}}'],
-    ids=["empty", "nothing said", "no such process", "this process, started earlier"],
+    [
+        "",
+        "{}",
+        '{"pid": -1, "started": "yesterday"}',
+        '{"pid": 4194304999, "started": 0}',
+        f'{{"pid": {os.getpid()}, "started": 5}}',
+    ],
+    ids=["empty", "nothing said", "no time", "no such process", "this process, started earlier"],
 )
 def test_a_lock_whose_process_is_gone_is_taken_over(tmp_path, content):
     (tmp_path / "lock").write_text(content)

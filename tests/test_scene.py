@@ -48,15 +48,11 @@ def test_photos_find_their_lights_by_name_in_any_order():
     assert np.allclose(scene.rgb.numpy(), truth.stack.rgb)
 
 
-def test_no_usable_light_is_told_with_the_numbers():
+def test_photos_without_a_usable_light_or_of_another_size_are_refused():
     _, truth = render((BALL,), SMALL)
     lights = tuple(replace(light, used=False) for light in truth.calibration.lights)
     with pytest.raises(ReconstructionError, match="0 of 5 photos"):
         build_scene(truth.stack, replace(truth.calibration, lights=lights), 60)
-
-
-def test_photos_of_another_size_than_the_calibration_are_refused():
-    _, truth = render((BALL,), SMALL)
     with pytest.raises(ReconstructionError, match="120 x 44"):
         build_scene(replace(truth.stack, full_width=120), truth.calibration, 60)
 

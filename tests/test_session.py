@@ -69,10 +69,13 @@ def test_flashlight_photos_by_a_phone_of_the_same_model_are_told_by_when_they_we
     assert len(session.board) == 4 and names(session.lit) == LIT and len(session.light) == N_LIT - 2
 
 
-def test_digits_of_other_scripts_and_above_the_line_are_no_numbers_to_sort_by(tmp_path):
-    folder, _, _ = save_capture(tmp_path, in_folders=True)
+def test_links_are_followed_and_digits_of_other_scripts_and_above_the_line_are_no_numbers_to_sort_by(tmp_path):
+    folder, _, _ = save_capture(tmp_path / "real", in_folders=True)
     (folder / "photos" / "IMG_101.jpg").rename(folder / "photos" / "²1.jpg")
-    assert names(load_session(folder).lit) == [*LIT[1:], "²1.jpg"]
+    (tmp_path / "linked").mkdir()
+    for name in ("board", "photos"):
+        (tmp_path / "linked" / name).symlink_to(folder / name)
+    assert names(load_session(tmp_path / "linked").lit) == [*LIT[1:], "²1.jpg"]
 
 
 def test_ground_truth_and_other_files_are_left_alone(tmp_path):
@@ -82,14 +85,6 @@ def test_ground_truth_and_other_files_are_left_alone(tmp_path):
     (folder / "notes.txt").write_text("hello")
     (folder / "._IMG_8.jpg").write_text("a file browser's shadow")
     assert names(load_session(folder).lit) == LIT
-
-
-def test_linked_photos_and_folders_are_followed(tmp_path):
-    folder, _, _ = save_capture(tmp_path / "real", in_folders=True)
-    (tmp_path / "linked").mkdir()
-    (tmp_path / "linked" / "board").symlink_to(folder / "board")
-    (tmp_path / "linked" / "photos").symlink_to(folder / "photos")
-    assert names(load_session(tmp_path / "linked").lit) == LIT
 
 
 def test_settings_overrule_what_was_found(tmp_path):

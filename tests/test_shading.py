@@ -11,11 +11,13 @@ from flashlight_photos import (
     POWER,
     WORLD_FROM_CAMERA,
     Recipe,
+    Truth,
     handheld_lights,
     photograph,
 )
 
 from calibration.flashlight import light_estimate
+from calibration.flashlight.duplicates import earlier_duplicate
 from calibration.flashlight.fit import collect, first_guess, fit_flashlights, without_gloss
 from calibration.flashlight.light_estimate import locate_lights
 from calibration.flashlight.model import (
@@ -30,6 +32,7 @@ from calibration.flashlight.model import (
 from calibration.flashlight.wall import WALL_TERMS
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
+from capture.photos.photo import encode_srgb
 
 
 def every(stack):
@@ -146,19 +149,61 @@ def test_a_tone_curve_that_is_not_the_assumed_one_is_covered_by_the_stated_sigma
     assert (in_sigmas < 2).mean() > 0.9 and (in_sigmas < 3).mean() > 0.985
 
 
-def test_three_photos_are_too_few(truth):
-    usable = np.arange(len(truth.stack.rgb)) < 3
-    with pytest.raises(CalibrationError, match="3 usable photos under the flashlight, 4 needed"):
-        locate_lights(truth.stack, POSED_CAMERA, usable)
-
-
-def test_over_exposed_ground_is_named_as_the_reason(truth):
-    clipped = np.ones_like(truth.stack.clipped)
-    with pytest.raises(CalibrationError, match=r"only 0 patches of bare, unclipped ground .* needed"):
-        locate_lights(replace(truth.stack, clipped=clipped), POSED_CAMERA, every(truth.stack))
-
-
-def test_a_camera_that_looks_past_the_ground_is_refused(truth):
+def test_too_few_photos_over_exposed_ground_and_a_camera_that_looks_past_it_are_refused(truth):
+    stack, all_photos = truth.stack, every(truth.stack)
+    over_exposed = replace(stack, clipped=np.ones_like(stack.clipped))
     level = replace(WORLD_FROM_CAMERA, rotation=np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
-    with pytest.raises(CalibrationError, match="does not look down at the ground"):
-        locate_lights(truth.stack, PosedCamera(CAMERA, level, 0.0), every(truth.stack))
+    for photos, camera, usable, said in (
+        (stack, POSED_CAMERA, np.arange(len(stack.rgb)) < 3, "3 usable photos under the flashlight, 4 needed"),
+        (over_exposed, POSED_CAMERA, all_photos, r"only 0 patches of bare, unclipped ground .* needed"),
+        (stack, PosedCamera(CAMERA, level, 0.0), all_photos, "does not look down at the ground"),
+    ):
+        with pytest.raises(CalibrationError, match=said):
+            locate_lights(photos, camera, usable)
+
+
+# --- photos under one and the same light -----------------------------------------------------------------------------
+
+
+def shaken(by_mm: float, n: int = 8) -> Truth:
+    """A flashlight held in one place by a hand that trembles."""
+    rng = np.random.default_rng(1)
+    held = handheld_lights(6, rng)[1]
+    places = np.array(held.position, float) + by_mm * rng.normal(size=(n, 3))
+    lights = tuple(replace(held, photo=f"{k}.jpg", position=place) for k, place in enumerate(places))
+    return photograph(Recipe(lights=lights))
+
+
+@pytest.mark.parametrize("by_mm", [0.0, 3.0])
+def test_a_flashlight_that_never_moves_is_refused(by_mm):
+    truth = shaken(by_mm)
+    with pytest.raises(CalibrationError, match="flashlight hardly moved, or these are copies"):
+        collect(truth.stack, POSED_CAMERA, every(truth.stack))
+
+
+@pytest.mark.slow
+def test_copies_encoded_again_at_another_exposure_are_named_and_not_used():
+    truth = photograph(Recipe(n_photos=8))
+    rgb = truth.stack.rgb.copy()
+    eight_bit = encode_srgb(rgb[2] * np.float32(0.8)).astype(np.float64) / 255
+    decoded = np.where(eight_bit <= 0.04045, eight_bit / 12.92, ((eight_bit + 0.055) / 1.055) ** 2.4)
+    rgb[5] = np.maximum(decoded, 1e-4)
+    found = locate_lights(replace(truth.stack, rgb=rgb), POSED_CAMERA, every(truth.stack))
+    assert [light.photo for light in found.lights if not light.used] == [truth.lights[5].photo]
+    assert f"lit as in {truth.lights[2].photo}" in found.lights[5].reason
+
+
+def test_three_lights_photographed_over_and_over_are_too_few():
+    rng = np.random.default_rng(2)
+    three = handheld_lights(3, rng)
+    truth = photograph(Recipe(lights=tuple(replace(three[k % 3], photo=f"{k}.jpg") for k in range(9))))
+    with pytest.raises(CalibrationError, match="3 different lights, 4 needed"):
+        collect(truth.stack, POSED_CAMERA, every(truth.stack))
+
+
+def test_a_flashlight_moved_by_fifteen_millimetres_is_another_light():
+    lights = handheld_lights(5, np.random.default_rng(3))
+    near = replace(lights[0], photo="near.jpg", position=np.add(np.array(lights[0].position, float), [0.0, 15.0, 0.0]))
+    truth = photograph(Recipe(lights=(*lights, near)))
+    evidence, _ = collect(truth.stack, POSED_CAMERA, every(truth.stack))
+    assert (earlier_duplicate(evidence) == np.arange(6)).all()

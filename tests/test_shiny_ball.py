@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from dataset_folders import from_above, towards_lights, write_photo
+from dataset_folders import calibrated, from_above, towards_lights, write_photo
 from synthetic import Box, Look, Sphere, grid_of, render
 
 from calibration.camera import Camera
@@ -13,8 +13,6 @@ from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError, CaptureError
 from reconstruct.fields import SolvedScene
 from reconstruct.run.pipeline import without_ball
-from reconstruct.source.calibrate_source import calibrate_source
-from reconstruct.source.photos import read_photos
 from reconstruct.source.source import RunOptions, open_source
 
 SIDE, BALL = 240, Ball(178.0, 62.0, 22.0)
@@ -52,10 +50,7 @@ def test_photos_with_a_ball_need_neither_board_nor_list(tmp_path, photographed, 
     write_capture(tmp_path, photographed, mirrored(photographed))
     if is_named:
         (tmp_path / "session.toml").write_text(f"ball = [{BALL.x}, {BALL.y}, {BALL.radius}]\n")
-    options = RunOptions()
-    source = open_source(tmp_path, options)
-    photos = read_photos(source, options)
-    calibration = calibrate_source(source, photos, options).first
+    _, photos, calibration = calibrated(tmp_path)
     found = np.array([light.direction for light in calibration.lights])
     off = np.arccos(np.clip((found * towards_lights(photographed)).sum(-1), -1, 1))
     sigma = np.array([light.sigma[0] for light in calibration.lights])

@@ -121,10 +121,15 @@ def test_of_a_file_that_states_other_tensors_than_are_needed_nothing_but_the_hea
             read_tensors(path, {"sdf": layout})
     with pytest.raises(ValueError, match="at most 1000 can be read"):
         read_tensors(path, most_numbers=1000)
-    header = json.dumps({"sdf": {"dtype": "F32", "shape": [1 << 31, 1 << 31], "data_offsets": [0, 4]}}).encode()
-    path.write_bytes(len(header).to_bytes(8, "little") + header + bytes(4))
-    with pytest.raises(ValueError, match="fits into no file"):
-        read_tensors(path)
+    for shape, fault in (
+        ([1 << 31, 1 << 31], "fits into no file"),
+        ([99999, 99999, 9], "fits into no"),
+        ([-1], "damaged"),
+    ):
+        header = json.dumps({"sdf": {"dtype": "F32", "shape": shape, "data_offsets": [0, 4]}}).encode()
+        path.write_bytes(len(header).to_bytes(8, "little") + header + bytes(4))
+        with pytest.raises(ValueError, match=fault):
+            read_tensors(path)
 
 
 # --- what is no file -------------------------------------------------------------------------------------------------
@@ -206,17 +211,6 @@ def test_fields_that_no_solve_leaves_do_not_reach_a_kernel(rest, match, run):
     changed(run, "fields.safetensors", **rest)
     with pytest.raises(UserError, match=match):
         load_fields(run / "fields.safetensors")
-
-
-def test_a_header_that_lies_about_the_file_is_refused_before_memory_is_taken(run, tmp_path):
-    path = run / "fields.safetensors"
-    data = path.read_bytes()
-    shape = str(list(damaged_runs._stored(path)[0]["sdf"].shape)).replace(" ", "").encode()
-    assert shape in data
-    for lie in (b"[9999999,1,1]", b"[99999,99999,9]", b"[-1,-1,-1]"):
-        path.write_bytes(data.replace(shape, lie))
-        with limited(tmp_path, room=100 << 20), pytest.raises(UserError, match=r"fields\.safetensors"):
-            load_fields(path)
 
 
 def document_with(run: Path, name: str, change) -> Path:

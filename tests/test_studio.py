@@ -2,17 +2,26 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
+from urllib.parse import quote
 
 import fake_run
 import pytest
 from studio_client import served
 from test_intake import jpeg
+from test_left_out import LIT, save_capture, truncated
 from waiting import wait_until
 
 from capture.errors import CaptureError, UserError
 from capture.files.atomic import write_json
+from capture.files.title import TITLE, as_name, hand_title_on, keep_title, title_of
+from reconstruct.export.export import default_file
+from reconstruct.stored_run.stored_run import StoredRun
+from viewer.report.report import read_results
+from viewer.stage.files import StageFiles
 from viewer.studio.folder import StudioFolder, Trash
+from viewer.studio.library import counts_of
 from viewer.studio_server.serve import serve
 
 
@@ -187,3 +196,138 @@ def test_what_was_put_back_does_not_replace_what_took_its_place(folder):
     capture_in(folder, "vase", 1)
     with pytest.raises(CaptureError, match="exists again"):
         trash.restore(deleted.id)
+
+
+# --- one count of photos for every sentence --------------------------------------------------------------------------
+
+
+def photo(role: str, drop: bool = False, looked: bool = True) -> dict[str, object]:
+    return {"role": role, "drop": drop, "looked": looked}
+
+
+LIT_36, BOARD_9 = [photo("lit")] * 36, [photo("board")] * 9
+NO_CHECK = {"is_old": True, "numbers": {"photos": 9, "photos_used": 9}}
+
+
+@pytest.mark.parametrize(
+    ("photos", "check", "words", "start", "uses"),
+    [
+        (LIT_36 + BOARD_9, NO_CHECK, "45 photos: 36 under the flashlight, 9 of the board", "Start", "36 of 36 photos"),
+        (
+            [*LIT_36, photo("lit", drop=True), photo("board", drop=True)],
+            NO_CHECK,
+            "38 photos: 36 under the flashlight, 2 left out",
+            "Leave 2 out and go on",
+            "36 of 37 photos",
+        ),
+        (
+            [*LIT_36, *BOARD_9],
+            {"is_old": False, "numbers": {"photos": 36, "photos_used": 35}},
+            "45 photos: 35 under the flashlight, 9 of the board, 1 left out",
+            "Leave it out and go on",
+            "35 of 36 photos",
+        ),
+        (
+            [photo("lit")] * 20 + [photo("", looked=False)] * 16,
+            NO_CHECK,
+            "36 photos: 20 under the flashlight, 16 not looked at yet",
+            "Start",
+            "",
+        ),
+        ([photo("lit")], NO_CHECK, "1 photo: 1 under the flashlight", "Start", "1 of 1 photo "),
+        ([], NO_CHECK, "0 photos", "Start", ""),
+    ],
+)
+def test_all_sentences_have_one_count(photos, check, words, start, uses):
+    found = counts_of(photos, check)
+    assert found["words"] == words and found["start"] == start and found["uses"].startswith(uses)
+
+
+def test_the_studio_counts_what_the_coach_saw_and_names_a_copy_on_arrival(tmp_path):
+    folder = save_capture(tmp_path / "captures" / "vase", True)
+    photos = folder / "photos"
+    truncated(photos / LIT[0])
+    shutil.copy(photos / LIT[1], photos / f"{Path(LIT[1]).stem} (1).jpg")
+    with served(tmp_path) as (_, _, client):
+
+        def row():
+            return client.get("/api/capture?key=captures%2Fvase")[1]
+
+        assert {one["role"] for one in row()["photos"]} == {"board", "lit"}, "before anything is looked at"
+        wait_until(lambda: all(one["looked"] for one in row()["photos"]))
+        found = row()
+    bad = {one["name"].split("/")[-1]: one["remarks"][0][0] for one in found["photos"] if one["drop"]}
+    assert bad == {LIT[0]: "unreadable", f"{Path(LIT[1]).stem} (1).jpg": "copy"}
+    assert found["counts"]["words"] == "8 photos: 5 under the flashlight, 1 of the board, 2 left out"
+    assert found["counts"]["start"] == "Leave 2 out and go on"
+    assert found["counts"]["uses"] == "5 of 7 photos under the flashlight will be used."
+
+
+# --- the title that a person typed -----------------------------------------------------------------------------------
+
+
+NAMES = {  # of the folder or file that a title gets
+    "Übung 1": "Übung 1",
+    "A cup / of tea: <b>": "A cup - of tea- -b-",
+    "🏺 vase": "🏺 vase",
+    "con": "_con",
+    "???": "it",
+    "猫" * 100: "猫" * 66,
+}
+
+
+@pytest.mark.parametrize(("title", "name"), NAMES.items())
+def test_a_title_is_a_name_that_every_system_takes(title, name):
+    assert as_name(title, "it") == name and len(name.encode()) < 250
+
+
+def test_the_title_that_was_typed_is_on_the_card_the_run_in_the_queue_and_after_a_restart(tmp_path):
+    title = "A cup / of tea: <b> " + "猫" * 80
+    with served(tmp_path) as (_, _, owner):
+        capture = owner.ok("new", title=f"  {title} ")
+        run = owner.ok("start", key=capture, preset="draft")
+        (card,) = owner.get("/api/state")[1]["cards"]
+        assert card["title"] == title and [row["title"] for row in card["runs"]] == [title]
+        assert owner.get(f"/api/capture?key={quote(capture)}")[1]["title"] == title
+        assert Path(run).name.endswith("-draft")
+    with served(tmp_path) as (_, _, owner):
+        assert owner.get("/api/state")[1]["cards"][0]["title"] == title
+
+
+def test_a_run_that_has_none_gets_the_title_of_its_capture_and_keeps_its_own(tmp_path):
+    capture, runs = tmp_path / "photos", [tmp_path / "one", tmp_path / "two"]
+    for folder in (capture, *runs):
+        folder.mkdir()
+    hand_title_on(capture, runs[0])
+    assert title_of(runs[0]) == "one"
+    keep_title(capture, "Übung 1")
+    keep_title(runs[1], "The second")
+    for run in runs:
+        hand_title_on(capture, run)
+    assert [title_of(run) for run in runs] == ["Übung 1", "The second"]
+
+
+def test_results_reports_pages_and_files_have_the_title(finished_run, tmp_path):
+    run, title = finished_run(tmp_path, has_stage=True), "🏺 A <cup> & {{scene}}"
+    assert StoredRun(run).name == "heap" and default_file(run, "glb").name == "heap.glb"
+    keep_title(run, title)
+    assert StoredRun(run).name == read_results(run).name == title
+    assert default_file(run, "glb").stem == as_name(title, "")
+    page = StageFiles(run).get("")
+    escaped = title.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    assert page is not None and f"<title>{escaped}" in page[0].decode()
+    assert "<cup>" not in page[0].decode()
+
+
+@pytest.mark.parametrize("content", [b"", b" \n\t ", b"\x00\x07", b"x" * 100_000, b"\xff\xfe"])
+def test_a_strangers_title_is_a_line_of_text_or_none(tmp_path, content):
+    (tmp_path / TITLE).write_bytes(content)
+    assert title_of(tmp_path) in (tmp_path.name, "\ufffd\ufffd")
+
+
+def test_a_title_without_a_letter_is_refused_and_makes_nothing(tmp_path):
+    with served(tmp_path) as (studio, _, _):
+        for title in ("", "  ", "\n\t", "\ud800"):
+            with pytest.raises(CaptureError, match="at least one letter"):
+                studio.new_capture(title)
+    assert not (tmp_path / "captures").exists()

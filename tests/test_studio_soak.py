@@ -3,7 +3,7 @@
 import psutil
 import pytest
 from studio_client import Process
-from test_studio_uploads import cut_piece, photos
+from test_studio_saving import cut_piece, photos
 
 WARM_UP = 0.3  # of the requests
 MOST_GROWTH, MOST_FILES = 0.05, 3

@@ -5,20 +5,13 @@ The draft is a real one, but brief. A picture of each step lies in the test's fo
 
 import pytest
 from brief_drafts import ENVIRONMENT, brief_command
-from chromium import PATIENCE_MS, STATE, wait_until
+from chromium import STATE, wait_until
 from small_example import small_example
 from studio_client import served
 from test_studio_browser import PHONE, RULES, opened
+from test_studio_first_screen_browser import stage_of
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
-
-
-def finished_stage(tab):
-    """The frame of a result once its own picture has come in place of the first one. Locators outlast a navigation."""
-    page = tab.frame_locator("iframe.result")
-    page.locator("#picture").wait_for(timeout=PATIENCE_MS)
-    page.locator("#first").wait_for(state="detached", timeout=PATIENCE_MS)
-    return tab.frames[-1]
 
 
 def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp_path, monkeypatch):
@@ -57,7 +50,7 @@ def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp
         tab.wait_for_selector("section.queue")
         look("home-at-work")
         tab.click("section.queue a")
-        stage = finished_stage(tab)
+        stage = stage_of(tab)
         look("result")
         box = tab.locator("iframe.result").bounding_box()
         middle = (box["x"] + 0.35 * box["width"], box["y"] + box["height"] / 2)

@@ -24,10 +24,6 @@ from capture.decode import sandbox as confined
 from capture.errors import UserError
 from capture.photos.photo import read_grey, read_photo, read_thumbnail
 from capture.session.session import load_session
-from reconstruct.fields import load_fields
-from reconstruct.run_folder.folder import RunFolder
-from reconstruct.solve.checkpoint import load_state
-from viewer.display.run_follower import RunFollower
 
 ROOT = Path(__file__).parent.parent
 SPOT = ROOT / "examples" / "spot"
@@ -82,9 +78,6 @@ def pickled(path: Path, kind: str) -> None:
     payload = Payload(path.parent / "RAN")
     if kind == "npy":
         np.save(path, np.array([payload], dtype=object), allow_pickle=True)
-    elif kind == "npz":
-        with path.open("wb") as file:
-            np.savez(file, light_pose=np.array([payload], dtype=object))
     elif kind == "pth":
         torch.save(payload, path)
     else:
@@ -136,63 +129,6 @@ def test_a_hostile_photo_is_refused_by_name_before_it_costs_anything(name, tmp_p
         assert not watch.ran and not watch.written
         assert not watch.read or name == "secret.png"  # what a link names is looked into, and refused
     assert not (tmp_path / "RAN").exists()
-
-
-def hostile_run(folder: Path, name: str) -> None:
-    path = folder / name
-    ply = b"ply\nformat binary_little_endian 1.0\nelement vertex 1000000000000\nproperty float x\nproperty float y\n"
-    ply += (
-        b"property float z\nelement face 1000000000000\nproperty list uchar int vertex_indices\nend_header\n"
-        + b"\0" * 99
-    )
-    contents: dict[str, bytes] = {
-        "mesh.ply": ply,
-        "manifest.json": b"[" * 100_000,
-        "calibration.json": b'{"a":' * 100_000,
-        "log.jsonl": b"[" * 100_000 + b"\n" + b'{"t": NaN}\n\xff\xfe\n',
-        "report.json": b'{"stages": ' + b"[" * 50_000,
-        "fields.safetensors": struct.pack("<Q", 2**62) + b"{}",
-        "checkpoint.safetensors": struct.pack("<Q", 10**9) + b"{" * 100,
-        "lock": b'{"pid": -1, "started": "yesterday"}',
-    }
-    if name.endswith(".npy"):
-        pickled(path, "npy")
-    else:
-        path.write_bytes(contents[name])
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("mesh.ply", ["export", "{run}", "{run}/a.stl"]),
-        ("calibration.json", ["export", "{run}", "{run}/a.stl"]),
-        ("report.json", ["report", "{run}"]),
-        ("depth.npy", ["report", "{run}"]),
-        ("log.jsonl", ["report", "{run}", "--bundle", "{run}/b.zip"]),
-    ],
-)
-def test_a_command_on_a_hostile_run_ends_in_one_sentence_or_well(name, words, tmp_path, capsys):
-    hostile_run(tmp_path, name)
-    with limited(tmp_path) as watch:
-        assert RunFollower(tmp_path).is_running() in (True, False)
-        code = shadowgraph.main([word.format(run=tmp_path) for word in words])
-    error = capsys.readouterr().err
-    assert code in (0, 2) and "Traceback" not in error
-    assert not watch.ran and not watch.written and not (tmp_path / "RAN").exists()
-
-
-def test_hostile_tensors_and_manifests_are_refused(tmp_path):
-    for name in ("fields.safetensors", "checkpoint.safetensors", "manifest.json", "lock"):
-        hostile_run(tmp_path, name)
-    pickled(tmp_path / "torch.safetensors", "pth")
-    with limited(tmp_path) as watch:
-        assert load_state(tmp_path / "checkpoint.safetensors", "any") is None
-        for name in ("fields.safetensors", "torch.safetensors"):
-            with pytest.raises(UserError, match=name):
-                load_fields(tmp_path / name)
-        with pytest.raises(UserError, match=r"manifest\.json"), RunFolder(tmp_path):
-            pass
-    assert not watch.ran and not watch.written and not (tmp_path / "RAN").exists()
 
 
 # --- a hostile capture -----------------------------------------------------------------------------------------------

@@ -7,13 +7,7 @@ import pytest
 import trimesh
 
 from viewer.display import layers
-from viewer.display.layers import (
-    FIRST_FOV,
-    framed_view,
-    light_position,
-    page_mesh,
-    page_scale,
-)
+from viewer.display.layers import FIRST_FOV, framed_view, light_position, page_mesh, page_scale
 from viewer.display.run_follower import RunFollower, loss_curves, size_text, status
 from viewer.page.controls import continued
 from viewer.page.page import Page
@@ -21,32 +15,26 @@ from viewer.page.page import Page
 ROOT = Path(__file__).parent.parent
 
 
-def test_the_status_says_stage_count_and_time_left():
+def test_the_status_says_stage_count_and_time_left_and_that_a_run_which_let_go_has_stopped():
     now = status(
         [{"t": 9, "stage": "solve/64", "done": 34, "total": 120, "eta_s": 40.0, "message": "grid of 64"}], True
     )
     assert (now.title, now.counts, now.left_s, now.is_over) == ("Fitting the surface", "34 of 120", 40.0, False)
     assert now.share == pytest.approx(34 / 120)
-
-
-# --- following a run -------------------------------------------------------------------------------------------------
-
-
-def test_a_run_that_let_go_before_the_end_has_stopped():
     now = status([{"t": 9, "stage": "hull", "done": 1, "total": 3, "message": ""}], is_running=False)
     assert now.title == "Stopped while carving the first shape"
     assert now.is_over and not now.is_finished
     assert status([{"t": 9, "stage": "done"}], is_running=False).is_finished
 
 
-def test_a_loss_that_a_line_does_not_have_is_a_gap_in_its_curve():
+# --- following a run -------------------------------------------------------------------------------------------------
+
+
+def test_a_loss_that_a_line_does_not_have_is_a_gap_that_its_curve_is_drawn_through_and_never_at_zero():
     lines = [{"t": 1, "numbers": {"loss_a": 3}}, {"t": 2}, {"t": 3, "numbers": {"loss_a": 2, "loss_b": 1, "grid": 64}}]
     seconds, losses = loss_curves(lines)
     assert seconds.tolist() == [1, 3] and sorted(losses) == ["loss_a", "loss_b"]
     assert losses["loss_a"].tolist() == [3, 2] and np.isnan(losses["loss_b"][0])
-
-
-def test_a_curve_with_gaps_is_drawn_through_them_and_never_at_zero():
     seconds, nan = np.array([0.0, 1.0, 2.0, 3.0, 4.0]), np.nan
     drawn = continued(seconds, np.array([nan, 4.0, nan, 1.0, 0.0]))
     assert drawn == pytest.approx([4.0, 4.0, 2.0, 1.0, 1.0])  # half-way in the logarithm; the ends go on level
@@ -80,7 +68,8 @@ def test_a_log_is_read_on_from_where_it_was_and_anew_if_it_is_another_runs(tmp_p
     with log.open("a") as file:
         file.write('\n{"t": 5}\n')
     assert [line["t"] for line in follower.log()] == [1, 2, 33, 4, 5]
-    log.write_text('{"t": 9, "stage": "a run that started anew and has written more than the one before it"}\n')
+    damaged = b"[" * 9999 + b'\n{"t": NaN}\n\xff\xfe\n'
+    log.write_bytes(damaged + b'{"t": 9, "stage": "a run that started anew and has written more than before"}\n')
     assert [line["t"] for line in follower.log()] == [9]
     log.unlink()
     assert follower.log() == []
