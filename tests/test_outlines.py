@@ -32,7 +32,7 @@ def ball():
 def test_right_lights_agree_and_wrong_ones_contradict(ball):
     _, lights, maps = ball
     every = np.ones(len(lights), bool)
-    terms = OutlineTerms(maps, EYE, 0.0, every, every)
+    terms = OutlineTerms(maps, EYE, 0.0, every)
     assert np.median(terms.misfit(lights)) < 0.3
     moved = lights.copy()
     moved[3] += [60.0, -40.0, 0.0]  # about 8 degrees
@@ -44,7 +44,7 @@ def test_a_photo_in_which_no_shadow_is_found_empties_no_space(ball):
     every, others = np.ones(len(lights), bool), maps.owner != 3
     fields = np.where(np.arange(len(maps.fields))[:, None, None] == 3, np.abs(maps.fields), maps.fields)
     parts = {name: getattr(maps, name)[others] for name in ("starts", "owner", "first_height")}
-    terms = OutlineTerms(replace(maps, fields=fields, **parts), EYE, 0.0, every, every)
+    terms = OutlineTerms(replace(maps, fields=fields, **parts), EYE, 0.0, every)
     assert np.median(terms.misfit(lights)) < 0.3
 
 
@@ -102,7 +102,7 @@ def test_outlines_show_where_the_led_sits_beside_its_phones_lens(ball):
     every, offset = np.ones(len(lights), bool), np.array([16.0, -9.0, 2.0])
     poses = [looking_at(light, MIDDLE) for light in lights]
     poses = [Pose(pose.rotation, light - pose.rotate(offset)) for pose, light in zip(poses, lights, strict=True)]
-    terms = OutlineTerms(maps, EYE, camera.ground_height, every, every & (np.arange(len(lights)) != 3))
+    terms = OutlineTerms(maps, EYE, camera.ground_height, every & (np.arange(len(lights)) != 3))
     found, covariance = offset_by_outlines(terms, [*poses[:3], None, *poses[4:]], lights)
     sigma = np.sqrt(np.diag(covariance))
     assert (np.abs(found - offset) < 2 * sigma).all() and np.linalg.norm(
@@ -195,7 +195,7 @@ def test_rows_are_derivatives_of_the_highlights_cost(ball):
     every = np.ones(len(lights), bool)
     points = np.array([[40.0, 60.0, 0.0], [-80.0, 10.0, 0.0]])
     spots = MirrorHighlights(np.array([2, 5]), points, np.array([0.02, 0.03]))
-    terms = OutlineTerms(maps, EYE, 0.0, every, every, spots)
+    terms = OutlineTerms(maps, EYE, 0.0, every, spots)
     miss, slope, owner = terms._half_vectors(lights)
     assert owner.tolist() == [2, 5]
     step = np.array([0.02, -0.03, 0.01])
@@ -232,7 +232,7 @@ def test_a_part_that_is_lit_as_the_ground_is_makes_right_lights_contradict_unles
     every = np.ones(len(lights), bool)
     tight, wide = (outline_maps(field, wrong, camera, unknown) for unknown in (False, True))
     assert tight is not None and wide is not None
-    misfit = [OutlineTerms(maps, EYE, 0.0, every, every).misfit(lights) for maps in (tight, wide)]
+    misfit = [OutlineTerms(maps, EYE, 0.0, every).misfit(lights) for maps in (tight, wide)]
     assert (misfit[0] > DROP_OUTLINE).mean() > OUTLINES_WRONG
     assert np.median(misfit[1]) < 0.3 and (misfit[1] < DROP_OUTLINE).all()
 
@@ -252,7 +252,7 @@ def _moved_together(lights: np.ndarray, m: float) -> np.ndarray:
 
 def _cost(maps, lights) -> float:
     every = np.ones(len(lights), bool)
-    return OutlineTerms(maps, EYE, 0.0, every, every).cost(lights)
+    return OutlineTerms(maps, EYE, 0.0, every).cost(lights)
 
 
 @pytest.mark.parametrize(
