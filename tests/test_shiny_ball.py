@@ -7,7 +7,7 @@ from dataset_folders import from_above, towards_lights, write_photo
 from synthetic import Box, Look, Sphere, grid_of, render
 
 from calibration.camera import Camera
-from calibration.lights.shiny_ball import Ball
+from calibration.lights.shiny_ball import Circle
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError, CaptureError
@@ -17,7 +17,7 @@ from reconstruct.source.calibrate_source import calibrate_source
 from reconstruct.source.photos import read_photos
 from reconstruct.source.source import RunOptions, open_source
 
-SIDE, BALL = 240, Ball(178.0, 62.0, 22.0)
+SIDE, BALL = 240, Circle(178.0, 62.0, 22.0)
 LUMP = Sphere((-20.0, -25.0, 30.0), 30.0)
 
 
