@@ -28,7 +28,9 @@ from calibration.flashlight.descent import refine
 from calibration.flashlight.duplicates import earlier_duplicate
 from calibration.flashlight.fit import (
     DROP_RESIDUAL,
+    GLOSS_ANGLE,
     LAST,
+    LOOSE_POWER,
     OVAL_PHOTOS,
     FlashlightFit,
     alike,
@@ -45,7 +47,6 @@ from calibration.flashlight.fit import (
 from calibration.flashlight.model import (
     NOISE,
     Flashlights,
-    Priors,
     cosines,
     free_tangent,
     log_irradiance,
@@ -149,7 +150,7 @@ def _colour(fit: FlashlightFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:
     powers, ambients, albedos = [], [], []
     for channel in range(3):
         evidence = replace(fit.evidence, log_grey=np.log(np.maximum(cells.rgb[..., channel], 1e-9)))
-        flashlights, weight = refine(fit.flashlights, evidence, Priors(log_power=0.1), lambda _: held, COLOUR_STEPS)
+        flashlights, weight = refine(fit.flashlights, evidence, LOOSE_POWER, lambda _: held, COLOUR_STEPS)
         shift = np.mean(
             flashlights.log_power - fit.flashlights.log_power
         )  # into albedo: the session's flashlight is white
@@ -220,7 +221,7 @@ def _residuals(fit: FlashlightFit, names: list[str], sigma: Float[np.ndarray, "p
     voting = fit.weight > 0
     relative, share = photo_quality(fit)
     angle = half_angles(fit.flashlights, fit.evidence.cells)
-    mirrored = voting & (angle < np.radians(22.0))
+    mirrored = voting & (angle < GLOSS_ANGLE)
     return {
         "shading_rms": float(np.sqrt(np.average(residual**2, weights=fit.weight))),
         "shading_rms_by_photo": {
