@@ -15,9 +15,8 @@ from calibration.known_scene import KnownScene
 from calibration.light import Light
 from calibration.lights.files import GivenLights, read_lights, read_opinions
 from calibration.lights.fusion import disagree, fuse
-from calibration.lights.known_ground import LONG_SIDE
 from calibration.lights.photo_lists import bare
-from calibration.lights.power import on_albedo_scale, with_common_power, with_power_per_photo
+from calibration.lights.power import LONG_SIDE, on_albedo_scale, with_common_power, with_power_per_photo
 from calibration.posed_camera import PosedCamera
 from calibration.reframed import reframed
 from calibration.side_photos.side_views import metric_cues, side_notes
@@ -121,7 +120,7 @@ def scene_with_file(scene: KnownScene, stack: PhotoStack | None, path: Path) -> 
     """
     own = scene.with_notes()
     photos = list(dict.fromkeys(light.photo for light in own.lights))
-    given = read_lights(path, photos, own.posed_camera, scene.every_photo)
+    given = read_lights(path, photos, own.posed_camera, scene.photos.every)
     _refuse_below(given.lights, own.ground_height, path)
     ambient = own.ambient if given.ambient is None else given.ambient
     lit = replace(own, lights=given.lights, beam=given.beam, ambient=ambient)

@@ -5,7 +5,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calibration.calibration import Calibration
-from capture.photos.finding import Finding
+from capture.session.sorting import ScenePhotos
+
+NO_PHOTOS = ScenePhotos([], [])
 
 
 @dataclass(frozen=True)
@@ -26,14 +28,13 @@ class KnownScene:
     dark_paths: tuple[Path, ...] = ()  # photos without light, which are subtracted
     lights_from: Path | None = None  # the user's file of lights that they come from
     notes: tuple[str, ...] = ()  # what was found, and what had to be assumed
-    photos_left_out: tuple[Finding, ...] = ()  # unreadable, or of another size; their lights are left out as well
-    every_photo: tuple[str, ...] = ()  # names in the order of the scene's files, before any was left out
+    photos: ScenePhotos = NO_PHOTOS  # which count, and which are left out: their lights are left out as well
 
     def with_notes(self) -> Calibration:
         """Return the calibration with notes and left-out photos among its residuals, for terminal and report."""
         residuals = self.calibration.residuals
         notes = [*residuals.get("notes", []), *self.notes]
-        said = {"notes": notes, "left_out_photos": [one.row() for one in self.photos_left_out]}
+        said = {"notes": notes, "left_out_photos": [one.row() for one in self.photos.left_out]}
         return replace(self.calibration, residuals=residuals | {key: rows for key, rows in said.items() if rows})
 
 

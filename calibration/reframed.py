@@ -127,17 +127,14 @@ def _seen_from(posed_camera: PosedCamera, homography: Float[np.ndarray, "3 3"], 
     camera = posed_camera.camera
     u, v = np.meshgrid(np.linspace(0, camera.width - 1, GRID), np.linspace(0, camera.height - 1, GRID))
     pixels = np.stack([u.ravel(), v.ravel()], -1)
-    rays = posed_camera.world_from_camera.rotate(camera.unproject(pixels))
+    rays = posed_camera.rays(pixels)
     down = rays[:, 2] < -1e-3 * np.linalg.norm(rays, axis=1)
     seen = cv2.perspectiveTransform(pixels[:, None], homography)[:, 0]
     inside = ((seen >= 0) & (seen < [camera.width, camera.height])).all(1)
     depth = homography[2] @ np.column_stack([pixels, np.ones(len(pixels))]).T
     chosen = down & inside & (depth > 0)
     if chosen.sum() >= FEWEST_POINTS:
-        eye = posed_camera.world_from_camera.translation
-        reach = (posed_camera.ground_height - eye[2]) / rays[chosen, 2]
-        points = eye + reach[:, None] * rays[chosen]
-        pose = _pose(points, camera, seen[chosen])
+        pose = _pose(posed_camera.on_ground(pixels[chosen]), camera, seen[chosen])
         if pose is not None and pose.translation[2] > posed_camera.ground_height:
             return replace(posed_camera, world_from_camera=pose)
     raise CalibrationError(

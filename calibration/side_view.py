@@ -44,7 +44,7 @@ class SideView:
         whole, _ = self.posed_camera.project_with_depth(points)
         size = [self.posed_camera.camera.width - 1, self.posed_camera.camera.height - 1]
         seen = (depth > 0) & ((whole >= 0) & (whole <= size)).all(-1)
-        beside = _signed_distance(~self.mask & self.sure)
+        beside = np.clip(signed_distance(~self.mask & self.sure), -FARTHEST, FARTHEST)
         found = map_coordinates(beside, pixels.T[::-1], order=1, mode="nearest")
         return np.where(seen, found * depth / camera.camera.fx, -np.inf)
 
@@ -58,11 +58,11 @@ class SideView:
         return self.camera.rays(np.stack([columns, rows], -1)[chosen].astype(float))
 
 
-def _signed_distance(inside: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    """Return the distance to the edge in px, positive inside."""
-    plus = np.asarray(cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 5))
-    minus = np.asarray(cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 5))
-    return np.clip(np.where(inside, plus - 0.5, 0.5 - minus), -FARTHEST, FARTHEST).astype(np.float32)
+def signed_distance(inside: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
+    """Return the signed distance in cells: positive inside, negative outside, zero half way between the two."""
+    plus = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 5)
+    minus = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 5)
+    return np.where(inside, plus - 0.5, 0.5 - minus)
 
 
 def run_lengths(mask: Bool[np.ndarray, "height width"]) -> list[int]:

@@ -10,7 +10,7 @@ from calibration.flashlight.light_estimate import LightFit, surely_placed
 from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import GROUND_LIKE, bare_ground, find_shadows, of_one_ground
 from calibration.ground.outline_model import witness_odds
-from calibration.ground.table_edges import find_table_edges, seen_beyond
+from calibration.ground.table_edges import find_table_edges, on_table
 from calibration.light import Light
 
 PHOTOS, HEIGHT, WIDTH = 6, 120, 160
@@ -212,7 +212,6 @@ def test_shadows_stains_and_a_ball_on_a_table_without_end_are_no_edge():
     rgb = photos(points, np.isfinite(points[..., 0]), 0.0, rng)
     rgb[:, :, : COLUMNS_SEEN // 3] *= 0.4  # a cloth: an edge of albedo, the same in all photos
     assert not find_table_edges(rgb, everywhere(rgb), points, EYE)
-    assert seen_beyond(rgb, everywhere(rgb), points, EYE) is None
 
 
 @pytest.mark.parametrize("count", [5, LIT])
@@ -228,8 +227,8 @@ def test_no_ground_and_no_shadow_is_seen_beyond_the_edge_and_the_object_before_i
     points, rng = table_points(), np.random.default_rng(4)
     beyond = outside(points, 90.0, 60.0)
     rgb = photos(points, ~beyond, 700.0, rng)
-    found = seen_beyond(rgb, everywhere(rgb), points, EYE)
-    assert found is not None and (found == beyond).mean() > 0.98
+    found = ~on_table(find_table_edges(rgb, everywhere(rgb), points, EYE), points)
+    assert (found == beyond).mean() > 0.98
     field = at_photo_size(fit_ground_field(rgb, everywhere(rgb), found), rgb, everywhere(rgb))
     shadows = find_shadows(field)
     rays = points - EYE

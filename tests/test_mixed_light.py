@@ -11,7 +11,7 @@ from flashlight_photos import POSED_CAMERA, Recipe, handheld_lights, photograph
 
 import calibration.calibrate as glue
 import calibration.flashlight.light_estimate as light_estimate
-from calibration.flashlight.fit import collect, first_guess, fit_flashlights, photo_quality
+from calibration.flashlight.fit import collect, first_fits, fit_flashlights, photo_quality
 from calibration.flashlight.light_estimate import LightFit
 from calibration.flashlight.model import free_tangent
 from calibration.lights.mixed_light import MixedLight, PhotoLight, find_mixture
@@ -31,7 +31,7 @@ def lights():
 def numbers(stack) -> PhotoLight:
     """What the ground's shading and the shadows say of each photo."""
     evidence, _ = collect(stack, POSED_CAMERA, np.ones(N, bool))
-    fit = fit_flashlights(first_guess(evidence), evidence, free_tangent)
+    fit = fit_flashlights(first_fits(evidence).best(), evidence, free_tangent)
     return PhotoLight.of(find_shadows(stack, [True] * N), fit.flashlights.log_power, photo_quality(fit)[0])
 
 

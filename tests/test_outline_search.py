@@ -8,7 +8,7 @@ from ball_shadows import EYE, RADIUS, ball_camera, drawn, hits_ball, photographe
 
 from calibration.flashlight import joint_search, outline_lights
 from calibration.flashlight.fit import ALIKE_POWER, FlashlightFit, does_not_follow, variance_about
-from calibration.flashlight.model import Evidence, Flashlights, free_tangent, log_irradiance
+from calibration.flashlight.model import Evidence, Flashlights, cost, free_tangent, log_irradiance
 from calibration.flashlight.pictured import bent
 from calibration.flashlight.wall import NO_WALL, Wall
 from calibration.lights.ground_cells import GroundCells
@@ -32,7 +32,7 @@ def _shaded(maps, lights: np.ndarray, wall: Wall = NO_WALL, grain: float = 0.02)
     aims = 30 * rng.standard_normal(lights.shape) * [1, 1, 0]
     truth = Flashlights(lights, aims, np.zeros(len(lights)), np.array([3.0, 0.0, 0.0, 0.0]), 0.0, np.zeros(3), wall)
     grey = log_irradiance(truth, evidence) + grain * rng.standard_normal(known.shape)
-    return replace(evidence, log_grey=grey, outlines=OutlineTerms(maps, EYE, 0.0, every, every))
+    return replace(evidence, log_grey=grey, outlines=OutlineTerms(maps, EYE, 0.0, every))
 
 
 def _state(places: np.ndarray, evidence: Evidence) -> Flashlights:
@@ -130,23 +130,26 @@ def test_a_photo_is_a_stray_that_the_shading_contradicts_or_of_which_less_ground
 def test_a_light_that_is_lost_is_looked_for_wherever_a_hand_reaches(ball):
     _, lights, maps = ball
     fit, evidence = _with_one_lost(maps, lights, 3)
-    found = joint_search._elsewhere((0.0, fit, joint_search.NOISE), evidence)
-    assert min(_off(one.flashlights.positions, lights)[3] for _, one, _ in found) < 0.1
-    mixed = joint_search._best_of_each((0.0, fit, joint_search.NOISE), [(0.0, fit, 0.0), *found], evidence)
+    lost = joint_search._judged(fit.flashlights, evidence, fit.weight)._replace(misfit=joint_search.NOISE)
+    found = joint_search._elsewhere(lost, evidence)
+    assert min(_off(one.fit.flashlights.positions, lights)[3] for one in found) < 0.1
+    mixed = joint_search._best_of_each(lost, [lost, *found], evidence)
     assert _off(mixed.positions, lights).max() < 0.15 < 0.5 < _off(fit.flashlights.positions, lights)[3]
 
 
 def test_fits_are_compared_by_the_cells_that_they_are_fitted_to(ball):
-    """A photo's misfit times k costs log k for each of its independent cells, and outlines weigh against it."""
+    """A photo's misfit times k costs log k for each of its independent cells; outlines and priors add theirs."""
     _, lights, maps = ball
     evidence = _shaded(maps, lights)
     state = Flashlights(lights, 0 * lights, np.zeros(len(lights)), np.zeros(4), 0.0, np.zeros(3))
-    fit = FlashlightFit(state, evidence, evidence.weight, ALIKE_POWER, free_tangent)
-    cells = (evidence.weight > 0).sum(1) / joint_search.alike(evidence.weight)
+    found, cells = joint_search._judged(state, evidence, evidence.weight), (evidence.weight > 0).sum(1)
     for times in (1.1, 4.0):
-        worse = replace(fit, evidence=replace(evidence, log_grey=evidence.log_grey + (times - 1) * fit.residual()))
-        gap = np.diff(joint_search._posteriors([(0.0, fit, 0.0), (1.5, worse, 0.0)], evidence))
-        np.testing.assert_allclose(gap, 1.5 + cells.sum() * np.log(times), rtol=1e-9)
+        grey = evidence.log_grey + (times - 1) * found.fit.residual()
+        worse = joint_search._judged(state, replace(evidence, log_grey=grey), evidence.weight)
+        gap = cells.sum() / joint_search.alike(evidence.weight) * np.log(times)
+        np.testing.assert_allclose(worse.posterior - found.posterior, gap, rtol=1e-9)
+    other = cost(state, evidence, 0 * evidence.weight, ALIKE_POWER)
+    np.testing.assert_allclose(found.posterior - found.by_shading.sum(), other, rtol=1e-9)
 
 
 def test_the_variance_of_a_mixture_is_about_the_fit_that_is_chosen():

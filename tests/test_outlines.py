@@ -32,7 +32,7 @@ def ball():
 def terms_of(maps, *spots) -> OutlineTerms:
     """The terms of all photos' outlines."""
     every = np.ones(len(ball_lights()), bool)
-    return OutlineTerms(maps, EYE, 0.0, every, every, *spots)
+    return OutlineTerms(maps, EYE, 0.0, every, *spots)
 
 
 def test_right_lights_agree_and_wrong_ones_contradict(ball):
@@ -106,7 +106,7 @@ def test_outlines_show_where_the_led_sits_beside_its_phones_lens(ball):
     every, offset = np.ones(len(lights), bool), np.array([16.0, -9.0, 2.0])
     poses = [looking_at(light, MIDDLE) for light in lights]
     poses = [Pose(pose.rotation, light - pose.rotate(offset)) for pose, light in zip(poses, lights, strict=True)]
-    terms = OutlineTerms(maps, EYE, camera.ground_height, every, every & (np.arange(len(lights)) != 3))
+    terms = OutlineTerms(maps, EYE, camera.ground_height, every & (np.arange(len(lights)) != 3))
     found, covariance = offset_by_outlines(terms, [*poses[:3], None, *poses[4:]], lights)
     sigma = np.sqrt(np.diag(covariance))
     assert (np.abs(found - offset) < 2 * sigma).all() and np.linalg.norm(

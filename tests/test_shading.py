@@ -18,7 +18,7 @@ from flashlight_photos import (
 
 from calibration.flashlight import light_estimate
 from calibration.flashlight.duplicates import earlier_duplicate
-from calibration.flashlight.fit import collect, first_guess, fit_flashlights, without_gloss
+from calibration.flashlight.fit import collect, first_fits, fit_flashlights, without_gloss
 from calibration.flashlight.light_estimate import locate_lights
 from calibration.flashlight.model import (
     LOWEST_COSINE,
@@ -117,7 +117,7 @@ def test_one_flashlight_is_not_five_times_as_strong_in_one_photo_as_in_the_other
 def test_a_glossy_table_is_noticed_and_its_highlights_left_out():
     truth = photograph(Recipe(n_photos=8, gloss=1.0))
     evidence, _ = collect(truth.stack, POSED_CAMERA, every(truth.stack))
-    plain = fit_flashlights(first_guess(evidence), evidence, free_tangent)
+    plain = fit_flashlights(first_fits(evidence).best(), evidence, free_tangent)
     careful = without_gloss(plain)
     assert (careful.evidence.weight == 0).sum() > (plain.evidence.weight == 0).sum()
     true = np.stack([light.position for light in truth.lights])

@@ -7,7 +7,7 @@ from dataset_folders import calibrated, from_above, towards_lights, write_photo
 from synthetic import Box, Look, Sphere, grid_of, render
 
 from calibration.camera import Camera
-from calibration.lights.shiny_ball import Ball
+from calibration.lights.shiny_ball import Circle
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError, CaptureError
@@ -15,7 +15,7 @@ from reconstruct.fields import SolvedScene
 from reconstruct.run.pipeline import without_ball
 from reconstruct.source.source import RunOptions, open_source
 
-SIDE, BALL = 240, Ball(178.0, 62.0, 22.0)
+SIDE, BALL = 240, Circle(178.0, 62.0, 22.0)
 LUMP = Sphere((-20.0, -25.0, 30.0), 30.0)
 
 

@@ -105,6 +105,10 @@ class FlashlightFit:
         """Return the log residuals of all samples."""
         return cell_residuals(self.flashlights, self.evidence, self.weight)
 
+    def ground(self) -> int:
+        """Return how many cells follow the light in some photo."""
+        return int((self.weight.sum(0) > 0).sum())
+
 
 def collect(
     stack: PhotoStack,
@@ -164,15 +168,6 @@ def first_fits(evidence: Evidence) -> FirstFits:
     costs = np.array([cost(state, thin, weight, ALIKE_POWER) for state, weight in found])
     best, weight = found[int(costs.argmin())]
     return FirstFits(tuple(state for state, _ in found), costs, independent(best, weight, thin))
-
-
-def first_guess(evidence: Evidence) -> Flashlights:
-    """Return the best of first_fits: world frame, powers relative to one another.
-
-    Raises:
-        CalibrationError: too little ground is usable in most photos.
-    """
-    return first_fits(evidence).best()
 
 
 def _on_sphere(evidence: Evidence, distance: float, beam: float) -> Flashlights:
@@ -247,10 +242,10 @@ def fit_flashlights(start: Flashlights, evidence: Evidence, tangent: Tangent) ->
     varies = POWER_SHARE * np.sqrt(max(seen**2 - POWER_ERROR**2, 0.0))
     priors = Priors(log_power=float(np.clip(varies, STEADY_POWER, LOOSE_POWER.log_power)), usual=usual)
     flashlights, weight = refine(flashlights, evidence, priors, tangent, NEAR + LAST)
-    ground = int((weight.sum(0) > 0).sum())
-    if ground < MIN_GROUND:
-        raise too_little_ground(ground)
-    return FlashlightFit(flashlights, evidence, weight, priors, tangent)
+    fit = FlashlightFit(flashlights, evidence, weight, priors, tangent)
+    if fit.ground() < MIN_GROUND:
+        raise too_little_ground(fit.ground())
+    return fit
 
 
 def too_little_ground(ground: int) -> CalibrationError:

@@ -5,8 +5,9 @@ Photos that are at odds add none.
 """
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -61,7 +62,15 @@ GAINED = 3.0  # of the negative log posterior, strong evidence [Kass and Raftery
 NEAR_INFINITY = 0.05  # a light that would be moved 20 times as far stays
 # tried first: as near as a wall behind a thing stands (mm), of middle grey; the fit moves them
 WALLS = tuple(np.array([azimuth, np.log(hand.NEAREST * 1.4), 0.5]) for azimuth in np.arange(8) * np.pi / 4)
-_Found = tuple[float, FlashlightFit, float]  # cost of outlines and priors, fit, misfit of its shading (log units)
+
+
+class _Found(NamedTuple):
+    """A fit, and how probable it is: negative logarithms, up to what all fits to the same evidence share."""
+
+    fit: FlashlightFit
+    misfit: float  # of its shading, log units
+    by_shading: Float[np.ndarray, " photos"]  # likelihood of each photo's shading
+    posterior: float
 
 
 def searched(
@@ -88,36 +97,37 @@ def searched(
     assert evidence.outlines is not None
     few = evidence.at(np.arange(0, len(evidence.cells.points), EVERY))
     few = replace(few, outlines=evidence.outlines.thinned(EVERY))
-    lines = [_settled(by_shading, few, _judged(by_shading, few, few.weight)[2])]
+    lines = [_settled(by_shading, few, _judged(by_shading, few, few.weight).misfit)]
     for number, one in enumerate(starts):
         LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", number + 1, len(starts))
         lines.append(_begun(replace(plain, positions=one), few))
     found = list(lines)
     for number in range(ROUNDS):
         LOG.info("fitting lights to outlines of shadows and shading, round %d of at most %d", number + 1, ROUNDS)
-        before = _posteriors(lines, few).min()
+        before = lines[0].posterior
         for line, best in enumerate(lines):
-            new = _improved(best, _likeliest(found, few, COMPARED), few)
-            lines[line] = _likeliest([best, *new], few, 1)[0]
+            new = _improved(best, _likeliest(found, COMPARED), few)
+            lines[line] = _likeliest([best, *new], 1)[0]
             found += new
-        if len(lines) == 1 and before - _posteriors(lines, few)[0] < GAINED:
+        if len(lines) == 1 and before - lines[0].posterior < GAINED:
             break
-        lines = _likeliest(lines, few, max(len(lines) // 2, 1))
+        lines = _likeliest(lines, max(len(lines) // 2, 1))
     (best,) = lines
-    posterior = _posteriors(found, few)
-    places = np.stack([one[1].flashlights.positions for one in found])
-    between = variance_about(best[1].flashlights.positions, places, np.exp((posterior.min() - posterior) / SCATTER))
-    return replace(_settled(best[1].flashlights, evidence, best[2])[1], between=between)
+    state = best.fit.flashlights
+    posterior = np.array([one.posterior for one in found])
+    places = np.stack([one.fit.flashlights.positions for one in found])
+    between = variance_about(state.positions, places, np.exp((posterior.min() - posterior) / SCATTER))
+    return replace(_settled(state, evidence, best.misfit).fit, between=between)
 
 
 def _improved(best: _Found, found: Sequence[_Found], evidence: Evidence) -> list[_Found]:
     """Return fits from the best one with a wall, at another distance, and with lights of the others that were found."""
-    state = best[1].flashlights
+    state = best.fit.flashlights
     walled = [_shaded(state, state.positions, wall, evidence) for wall in WALLS if state.wall[2] <= 0]
     hops = [one for times in HOPS for one in _both(state, farther(state.positions, evidence, times), evidence)]
-    tried = [*_likeliest(walled, evidence, 1), *_likeliest(hops, evidence, 1)]
-    mixed = _settled(_best_of_each(best, [*found, *_elsewhere(best, evidence)], evidence), evidence, best[2])
-    return [mixed, *(_settled(fit.flashlights, evidence, misfit) for _, fit, misfit in tried)]
+    tried = [*_likeliest(walled, 1), *_likeliest(hops, 1)]
+    mixed = _settled(_best_of_each(best, [*found, *_elsewhere(best, evidence)], evidence), evidence, best.misfit)
+    return [mixed, *(_settled(one.fit.flashlights, evidence, one.misfit) for one in tried)]
 
 
 def _elsewhere(best: _Found, evidence: Evidence) -> list[_Found]:
@@ -126,20 +136,23 @@ def _elsewhere(best: _Found, evidence: Evidence) -> list[_Found]:
     One photo's shading has several minima, and outlines hold a light in a false one while other lights are still off.
     Albedo, beam, response and wall are the best fit's, so that a grid tells each light's places without a fit.
     """
-    (_, fit, misfit), centre = best, evidence.cells.centre
-    state, albedo = fit.flashlights, log_albedo(fit.flashlights, evidence, fit.weight)
+    state, centre = best.fit.flashlights, evidence.cells.centre
+    albedo = log_albedo(state, evidence, best.fit.weight)
     grid = np.concatenate([centre + reach * DIRECTIONS for reach in REACHES])
     power = np.full(len(grid), np.median(state.log_power))
     there = replace(state, positions=grid, targets=np.repeat(state.aim[None], len(grid), 0), log_power=power)
+    light, among = log_irradiance(there, evidence), log_irradiance(state, evidence)
+    exposure = np.zeros(len(among)) if evidence.exposure is None else evidence.exposure
     chosen = np.zeros((PLACES, len(state.positions)), int)
-    for photo, shown in enumerate(_pictured_from(there, state, evidence)):
+    for photo, exposed in enumerate(exposure - np.median(among + exposure[:, None])):
+        shown = light + bend(light + exposed, state.response) if len(state.response) else light
         off = (evidence.log_grey[photo] - albedo - shown)[:, evidence.weight[photo] > 0]
         order = np.median(np.abs(off - np.median(off, axis=1, keepdims=True)), axis=1).argsort()
         for rank in range(PLACES):
             chosen[rank, photo] = order[0]
             apart = np.linalg.norm(grid[order] - grid[order[0]], axis=1)
             order = order[apart > BESIDE * np.linalg.norm(grid[order[0]] - centre)]
-    alone, found = replace(_weighted(evidence, misfit), outlines=None), []
+    alone, found = replace(_weighted(evidence, best.misfit), outlines=None), []
     for some in chosen:
         moved = replace(there, positions=grid[some], targets=there.targets[some], log_power=power[some])
         new, weight = refine(moved, alone, ALIKE_POWER, own_tangent, FAR[:6] + NEAR[-2:])
@@ -147,20 +160,9 @@ def _elsewhere(best: _Found, evidence: Evidence) -> list[_Found]:
     return found
 
 
-def _pictured_from(
-    there: Flashlights, flashlights: Flashlights, evidence: Evidence
-) -> Iterator[Float[np.ndarray, "places cells"]]:
-    """Yield for each photo what log_pictured would show of it, were its light any of those `there`."""
-    light, among = log_irradiance(there, evidence), log_irradiance(flashlights, evidence)
-    exposure = np.zeros(len(among)) if evidence.exposure is None else evidence.exposure
-    middle = np.median(among + exposure[:, None])
-    for one in exposure:
-        yield light + bend(light + (one - middle), flashlights.response) if len(flashlights.response) else light
-
-
 def settled(start: Flashlights, evidence: Evidence) -> FlashlightFit:
     """Return the fit to outlines and shading from a state near the answer."""
-    return _settled(start, evidence, _shaded(start, start.positions, start.wall, evidence)[2])[1]
+    return _settled(start, evidence, _shaded(start, start.positions, start.wall, evidence).misfit).fit
 
 
 def _by_outlines(start: Flashlights, evidence: Evidence) -> Flashlights:
@@ -181,8 +183,8 @@ def _begun(start: Flashlights, evidence: Evidence) -> _Found:
     """Return the best of two fits from where outlines alone lead the lights, each at the likeliest distance."""
     places = _by_outlines(start, evidence).positions
     tried = [_both(start, farther(places, evidence, times), evidence) for times in FARTHER]
-    best = [_likeliest(same, evidence, 1)[0] for same in zip(*tried, strict=True)]
-    return _likeliest([_settled(fit.flashlights, evidence, misfit) for _, fit, misfit in best], evidence, 1)[0]
+    best = [_likeliest(same, 1)[0] for same in zip(*tried, strict=True)]
+    return _likeliest([_settled(one.fit.flashlights, evidence, one.misfit) for one in best], 1)[0]
 
 
 def _both(like: Flashlights, places: Float[np.ndarray, "photos 3"], evidence: Evidence) -> tuple[_Found, _Found]:
@@ -229,20 +231,20 @@ def _best_of_each(best: _Found, found: Sequence[_Found], evidence: Evidence) -> 
 
     A photo's shading counts as cells whose errors are independent, its outlines as they do in the fit.
     """
-    terms, state = evidence.outlines, best[1].flashlights
+    terms, state = evidence.outlines, best.fit.flashlights
     assert terms is not None
     own = np.eye(len(state.positions)) > 0
     costs = []
-    for _, fit, _ in found:
-        moved = np.where(own[..., None], fit.flashlights.positions, state.positions)
+    for other in found:
+        moved = np.where(own[..., None], other.fit.flashlights.positions, state.positions)
         shadows = [replace(terms, trusted=terms.trusted | one).cost(at) for one, at in zip(own, moved, strict=True)]
-        costs.append(_by_shading(fit, evidence) + shadows)
+        costs.append(other.by_shading + shadows)
     chosen = np.argmin(costs, axis=0)
 
     def taken(values: Sequence[np.ndarray]) -> np.ndarray:
         return np.stack(values)[chosen, np.arange(len(chosen))]
 
-    states = [fit.flashlights for _, fit, _ in found]
+    states = [other.fit.flashlights for other in found]
     return replace(
         state,
         positions=taken([one.positions for one in states]),
@@ -251,29 +253,8 @@ def _best_of_each(best: _Found, found: Sequence[_Found], evidence: Evidence) -> 
     )
 
 
-def _posteriors(found: Sequence[_Found], evidence: Evidence) -> Float[np.ndarray, " found"]:
-    """Return the negative log posteriors of fits to the same evidence, up to a constant that they share.
-
-    A wall pays for its terms [Schwarz, Estimating the Dimension of a Model, Annals of Statistics 6 (1978)].
-    """
-    cells = (evidence.weight > 0).sum() / alike(evidence.weight)
-    walls = np.array([fit.flashlights.wall[2] > 0 for _, fit, _ in found])
-    shading = np.array([_by_shading(fit, evidence).sum() for _, fit, _ in found])
-    return np.array([one[0] for one in found]) + shading + walls * WALL_TERMS / 2 * np.log(cells)
-
-
-def _by_shading(fit: FlashlightFit, evidence: Evidence) -> Float[np.ndarray, " photos"]:
-    """Return the negative log likelihood of each photo's shading, up to a constant.
-
-    A photo counts as cells whose errors are independent, of a size of its own: log(misfit) for each.
-    """
-    known = evidence.weight > 0
-    misfit = [spread(r[k]) if k.any() else 1.0 for r, k in zip(fit.residual(), known, strict=True)]
-    return known.sum(1) / alike(evidence.weight) * np.log(np.maximum(misfit, NO_GROUND))
-
-
-def _likeliest(found: Sequence[_Found], evidence: Evidence, count: int) -> list[_Found]:
-    return [found[k] for k in _posteriors(found, evidence).argsort(kind="stable")[:count]]
+def _likeliest(found: Sequence[_Found], count: int) -> list[_Found]:
+    return [found[k] for k in np.argsort([one.posterior for one in found], kind="stable")[:count]]
 
 
 def _settled(start: Flashlights, evidence: Evidence, misfit: float) -> _Found:
@@ -283,17 +264,26 @@ def _settled(start: Flashlights, evidence: Evidence, misfit: float) -> _Found:
         weighted = _weighted(evidence, misfit)
         start, weight = refine(start, weighted, ALIKE_POWER, without_wall, FAR[:4] + NEAR)
         found = _judged(start, evidence, weight)
-        misfit = found[2]
+        misfit = found.misfit
     assert found is not None
     return found
 
 
 def _judged(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> _Found:
-    """Return a state as a fit, with the cost of its outlines and priors and the misfit of its shading."""
-    misfit = spread(cell_residuals(flashlights, evidence, weight)[evidence.weight > 0])
+    """Return a state as a fit, and how probable it is by outlines, priors and shading.
+
+    A photo's shading counts as cells whose errors are independent, of a size of its own: log(misfit) for each. A wall
+    pays for its terms [Schwarz, Estimating the Dimension of a Model, Annals of Statistics 6 (1978)].
+    """
+    residual, known, worth = cell_residuals(flashlights, evidence, weight), evidence.weight > 0, alike(evidence.weight)
+    misfit = spread(residual[known])
     fit = FlashlightFit(flashlights, _weighted(evidence, misfit), weight, ALIKE_POWER, without_wall)
+    own = [spread(r[k]) if k.any() else 1.0 for r, k in zip(residual, known, strict=True)]
+    by_shading = known.sum(1) / worth * np.log(np.maximum(own, NO_GROUND))
     lost = 0.0 if (weight > 0).any() else LOST
-    return lost + cost(flashlights, evidence, np.zeros_like(weight), ALIKE_POWER), fit, misfit
+    other = lost + cost(flashlights, evidence, np.zeros_like(weight), ALIKE_POWER)
+    terms = (flashlights.wall[2] > 0) * WALL_TERMS / 2 * np.log(known.sum() / worth)
+    return _Found(fit, misfit, by_shading, other + by_shading.sum() + terms)
 
 
 def _weighted(evidence: Evidence, misfit: float) -> Evidence:

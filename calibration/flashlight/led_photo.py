@@ -279,14 +279,9 @@ def _circles(view: UInt8[np.ndarray, "side side"], roundness: float) -> Float[np
     return np.zeros((0, 3)) if found is None else found.reshape(-1, found.shape[-1])[:, :3].astype(np.float64)
 
 
-def _distance_to_led(circle: Circle) -> float:
-    """From the circle's middle to the LED, which is in the middle of the view; mm."""
-    return float(np.linalg.norm(circle[:2] / DOTS_PER_MM - REACH_MM))
-
-
 def _is_lens(view: UInt8[np.ndarray, "side side"], circle: Circle, led_mm: float) -> bool:
-    """Return whether a circle is near the LED and dark, and neither its window nor its glare."""
-    apart = _distance_to_led(circle)
+    """Return whether a circle is near the LED, in the middle of the view, and dark, and neither window nor glare."""
+    apart = float(np.linalg.norm(circle[:2] / DOTS_PER_MM - REACH_MM))
     return max(led_mm / 2, float(circle[2]) / DOTS_PER_MM) <= apart <= REACH_MM and _is_dark(view, circle)
 
 

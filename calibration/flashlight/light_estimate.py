@@ -1,4 +1,18 @@
-"""Turn fitted flashlights into lights with power in colour, a realistic uncertainty and a verdict per photo."""
+"""Turn fitted flashlights into lights with power in colour, a realistic uncertainty and a verdict per photo.
+
+The stated error of a light that was found by the ground's shading is made of lengths that its own photo and the fit
+show:
+
+- ground: the formal error of the fit, of as many independent numbers as a photo's ground tells: what the model lacks is
+  smooth over the ground, so that neighbouring cells err alike;
+- power: a flashlight has one power. Where the fitted powers differ, distances are wrong instead: light falls with the
+  distance squared, so half of a light's own log power, and of the spread of all, is a share of its distance. A photo
+  that was exposed otherwise counts only up to where the fit takes it for one;
+- starts: fits from other starts that explain a few cells about as well lie elsewhere (fit.FirstFits);
+- what no residual shows: a small share of the distance.
+
+The error of the camera's pose is added in calibration.calibrate.
+"""
 
 import logging
 from collections.abc import Callable
@@ -7,14 +21,19 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.sparse import csr_array
 
 from calibration.flashlight.beam_profile import without_splines
 from calibration.flashlight.descent import refine
 from calibration.flashlight.duplicates import earlier_duplicate
 from calibration.flashlight.fit import (
     DROP_RESIDUAL,
+    GLOSS_ANGLE,
     LAST,
+    LOOSE_POWER,
+    OVAL_PHOTOS,
     FlashlightFit,
+    alike,
     before_ends,
     collect,
     first_fits,
@@ -25,10 +44,15 @@ from calibration.flashlight.fit import (
     with_oval_beams,
     without_gloss,
 )
-from calibration.flashlight.model import Flashlights, Priors, cosines, free_tangent
+from calibration.flashlight.model import (
+    NOISE,
+    Flashlights,
+    cosines,
+    free_tangent,
+    normal_equations,
+)
 from calibration.flashlight.outline_lights import OUTLINE_SIDE, outline_sigma, with_outlines
 from calibration.flashlight.pictured import as_pictured, with_response
-from calibration.flashlight.uncertainty import position_sigma, unseen_error
 from calibration.flashlight.wall import WALL_TERMS
 from calibration.light import Light, Vector
 from calibration.lights import hand
@@ -36,6 +60,7 @@ from calibration.lights.ground_cells import ground_ends
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
 from calibration.outlines.terms import DROP_OUTLINE
 from calibration.posed_camera import PosedCamera
+from capture.checks.mixture import STEADY, levels
 from capture.checks.robust import spread
 from capture.photos.photo import PhotoStack
 
@@ -59,6 +84,8 @@ BY_SEVERAL = (
     ". Several placements of the lights explain these photos about as well; they lie {:.0%} of its distance about "
     "the one that was taken. A photo from the side, the object's height, or photos in light/ decide between them"
 )
+HONEST_SHARE = 0.0035  # of the range: what no residual shows
+FEW_SHARE = 0.02  # of the range, with too few photos to see whether the beam is round: as 2 % of asymmetry costs
 COLOUR_STEPS = LAST[:4]  # the channels differ from their mean by a few per cent: few steps suffice
 
 
@@ -120,7 +147,7 @@ def _colour(fit: FlashlightFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:
     powers, ambients = [], []
     for channel in range(3):
         evidence = replace(fit.evidence, log_grey=np.log(np.maximum(cells.rgb[..., channel], 1e-9)))
-        flashlights = refine(fit.flashlights, evidence, Priors(log_power=0.1), lambda _: held, COLOUR_STEPS)[0]
+        flashlights = refine(fit.flashlights, evidence, LOOSE_POWER, lambda _: held, COLOUR_STEPS)[0]
         shift = np.mean(
             flashlights.log_power - fit.flashlights.log_power
         )  # into albedo: the session's flashlight is white
@@ -187,7 +214,7 @@ def _residuals(fit: FlashlightFit, names: list[str], sigma: Float[np.ndarray, "p
     voting = fit.weight > 0
     relative, share = photo_quality(fit)
     angle = half_angles(fit.flashlights, fit.evidence.cells)
-    mirrored = voting & (angle < np.radians(22.0))
+    mirrored = voting & (angle < GLOSS_ANGLE)
     return {
         "shading_rms": float(np.sqrt(np.average(residual**2, weights=fit.weight))),
         "shading_rms_by_photo": {
@@ -202,7 +229,7 @@ def _residuals(fit: FlashlightFit, names: list[str], sigma: Float[np.ndarray, "p
         else float(np.linalg.norm(fit.flashlights.oval, axis=1).mean()),
         "power_spread": spread(fit.flashlights.log_power - np.median(fit.flashlights.log_power)),
         "ambient_share": float(fit.flashlights.ambient / np.exp(fit.flashlights.log_power).mean()),
-        "ground_cells": int((fit.weight.sum(0) > 0).sum()),
+        "ground_cells": fit.ground(),
         "gloss": float(np.median(residual[mirrored])) if mirrored.any() else 0.0,
     }
 
@@ -216,6 +243,32 @@ def surely_placed(found: LightFit, centre: Float[np.ndarray, "3"]) -> float:
     sigma = np.array([np.linalg.norm(light.sigma) for light in found.lights])
     reach = np.linalg.norm([light.homogeneous()[:3] - centre for light in found.lights], axis=1)
     return float(np.mean(np.array([light.used for light in found.lights]) & (sigma < SURE_SIGMA * reach)))
+
+
+def position_sigma(fit: FlashlightFit) -> Float[np.ndarray, "photos 3"]:
+    """Return one sigma per coordinate of the positions, world: of the fit itself, and between fits from other starts.
+
+    The inverse of the normal matrix with priors, its samples weighted by the residuals' spread and by how many cells
+    err together [Kish, Survey Sampling (1965), section 5.4].
+    """
+    n, own = len(fit.flashlights.positions), fit.flashlights.per_flashlight()
+    known = fit.weight > 0
+    noise = max(spread((np.sqrt(fit.evidence.weight) * fit.residual())[known]), NOISE)
+    trust = 1 / (noise**2 * alike(fit.weight))
+    evidence = replace(fit.evidence, weight=trust * fit.evidence.weight)
+    matrix, _ = normal_equations(fit.flashlights, evidence, trust * fit.weight, fit.priors)
+    basis = csr_array(fit.tangent(fit.flashlights))
+    covariance = basis @ np.linalg.pinv(basis.T @ matrix @ basis, hermitian=True) @ basis.T
+    variance = np.diag(covariance)[: own * n].reshape(n, own)[:, :3]
+    return np.sqrt(np.maximum(variance, 0) + fit.between)
+
+
+def unseen_error(fit: FlashlightFit) -> Float[np.ndarray, " photos"]:
+    """Return the position error (world unit) that no residual of positions from shading alone shows."""
+    reach = np.linalg.norm(fit.flashlights.positions - fit.evidence.cells.centre, axis=1)
+    own = fit.flashlights.log_power - levels(fit.flashlights.log_power, STEADY)
+    by_power = 0.5 * np.hypot(np.minimum(np.abs(own), fit.priors.power_outlier), spread(own))
+    return np.hypot(HONEST_SHARE if len(reach) >= OVAL_PHOTOS else FEW_SHARE, by_power) * reach
 
 
 def told_doubt(fit: FlashlightFit) -> str:

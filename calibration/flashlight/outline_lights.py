@@ -27,11 +27,11 @@ from calibration.flashlight.model import (
     normal_equations,
 )
 from calibration.flashlight.pictured import bent
-from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
+from calibration.ground.ground_field import GroundField, at_photo_size
 from calibration.ground.ground_shadows import GroundShadows, find_shadows, of_one_ground
 from calibration.ground.mirror_highlights import find_highlights
 from calibration.ground.table_edges import TableEdge
-from calibration.lights.ground_cells import CELL, beyond_ends, ground_points
+from calibration.lights.ground_cells import CELL, field_of, ground_points
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
 from calibration.outlines.outline_maps import OutlineMaps, outline_maps, with_cues
 from calibration.outlines.shadow_start import shadow_starts
@@ -54,8 +54,8 @@ def with_outlines(
     posed_camera: PosedCamera,
     photos: Bool[np.ndarray, " photos"],
     by_shading: Flashlights,
-    edges: Sequence[TableEdge] = (),
-    cues: MetricCues = NO_CUES,
+    edges: Sequence[TableEdge],
+    cues: MetricCues,
 ) -> FlashlightFit | None:
     """Return the joint fit, world frame; None without an object, enough shadows, or ground that follows.
 
@@ -79,7 +79,7 @@ def with_outlines(
     if wide is not None and _at_odds(fit, wide) < REPAIRED * _at_odds(fit, terms):
         terms = wide
         fit = searched([], fit.flashlights, replace(cells, outlines=wide))
-    if _ground(fit) < MIN_GROUND:
+    if fit.ground() < MIN_GROUND:
         return None
     # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share
     agreeing = replace(cells, outlines=replace(terms, trusted=~_contradicts(fit)))
@@ -107,7 +107,7 @@ def _bare_ground(evidence: Evidence, shadows: GroundShadows, maps: OutlineMaps, 
 
 
 def outlines_of(
-    stack: PhotoStack, posed_camera: PosedCamera, photos: Bool[np.ndarray, " photos"], edges: Sequence[TableEdge] = ()
+    stack: PhotoStack, posed_camera: PosedCamera, photos: Bool[np.ndarray, " photos"], edges: Sequence[TableEdge]
 ) -> OutlineTerms | None:
     """Return the outlines in these photos of the stack, those trusted that the picture does not cut.
 
@@ -120,9 +120,8 @@ def _ground_and_shadows(
     stack: PhotoStack, posed_camera: PosedCamera, photos: Bool[np.ndarray, " photos"], edges: Sequence[TableEdge]
 ) -> tuple[GroundField, GroundField, GroundShadows]:
     """Return the ground's field, coarse and as sharp as outlines need it, and the shadows on it."""
-    rgb, usable = stack.rgb[photos], ~stack.clipped[photos]
-    coarse = fit_ground_field(rgb, usable, beyond_ends(edges, posed_camera, rgb.shape[1:3]))
-    field = at_photo_size(coarse, rgb, usable, OUTLINE_SIDE)
+    coarse = field_of(stack, posed_camera, photos, edges)
+    field = at_photo_size(coarse, stack.rgb[photos], ~stack.clipped[photos], OUTLINE_SIDE)
     return coarse, field, of_one_ground(find_shadows(field))
 
 
@@ -139,22 +138,16 @@ def _terms(
     if maps is None or maps.is_outlined().mean() < LEAST_SHADOWS:
         return None
     maps = with_cues(maps, cues, posed_camera)
-    every = np.ones(maps.n_photos(), bool)
     whole = ~maps.is_cut & maps.is_outlined()
     points, down = ground_points(posed_camera.resized(*coarse.albedo.shape[::-1]))
     spots = find_highlights(coarse, find_shadows(coarse), np.where(down[..., None], points, np.nan))
-    trusted = whole if whole.sum() >= FEWEST_WHOLE else every
-    return OutlineTerms(maps, posed_camera.centre, posed_camera.ground_height, every, trusted, spots)
+    trusted = whole if whole.sum() >= FEWEST_WHOLE else np.ones_like(whole)
+    return OutlineTerms(maps, posed_camera.centre, posed_camera.ground_height, trusted, spots)
 
 
 def _at_odds(fit: FlashlightFit, terms: OutlineTerms) -> float:
     """Return the share of the trusted photos whose shadows contradict the others', with the lights where they are."""
     return float((terms.misfit(fit.flashlights.positions) > DROP_OUTLINE)[terms.trusted].mean())
-
-
-def _ground(fit: FlashlightFit) -> int:
-    """Return how many ground cells follow the lights."""
-    return int((fit.weight.sum(0) > 0).sum())
 
 
 def _contradicts(fit: FlashlightFit) -> Bool[np.ndarray, " photos"]:

@@ -19,11 +19,10 @@ from calibration.flashlight.fit import (
     without_gloss,
 )
 from calibration.flashlight.led_photo import FITTED_SIGMA, QUARTER_TURNS, BackView, Choice, choose
-from calibration.flashlight.light_estimate import LightFit, describe
+from calibration.flashlight.light_estimate import LightFit, describe, position_sigma, unseen_error
 from calibration.flashlight.model import Flashlights, free_tangent
 from calibration.flashlight.outline_lights import outlines_of
 from calibration.flashlight.pictured import with_response
-from calibration.flashlight.uncertainty import position_sigma, unseen_error
 from calibration.ground.table_edges import TableEdge
 from calibration.lights.fusion import disagree, fuse
 from calibration.lights.ground_cells import ground_ends
@@ -66,7 +65,7 @@ class _Carried:
     """The phone's lens and world_from_phone per lit photo; None where only shading gives the flashlight's place."""
 
     poses: tuple[Pose | None, ...]
-    reach: Float[np.ndarray, " photos"]  # how far along the beam its target lies
+    reach: Float[np.ndarray, " photos"]  # how far along the beam it passes the scene
 
     def posed(self) -> Bool[np.ndarray, " photos"]:
         """Which lit photos have a pose."""
@@ -100,7 +99,8 @@ def locate_lights_from_phone(
     partner = pair_in_order(poses, alone.flashlights, evidence.cells.centre, photos)
     if len(poses) == len(usable) and (partner >= 0).sum() < FEWEST_PAIRED * len(photos):
         partner = pair_in_step(poses, alone.flashlights, evidence.cells.centre, photos, partner)
-    carried = _carry([poses[p] if p >= 0 else None for p in partner], alone)
+    reach = np.linalg.norm(alone.flashlights.positions - alone.flashlights.aim, axis=1)
+    carried = _Carried(tuple(poses[p] if p >= 0 else None for p in partner), reach)
     if carried.posed().sum() < MIN_VIEWS:
         raise _too_few(int(carried.posed().sum()), views)
     lens_error = lens.camera.sigmas["fx"] / lens.camera.fx * carried.reach  # a longer lens stands farther away
@@ -312,11 +312,6 @@ def pair_in_step(
     apart = min(price(shift) for shift in range(-SHIFTS, SHIFTS + 1) if shift)
     seen = np.array([poses[k] is not None for k in photos])
     return np.where(seen, photos, -1) if price(0) < IN_STEP * apart else otherwise
-
-
-def _carry(poses: list[Pose | None], alone: FlashlightFit) -> _Carried:
-    """Return the poses with the distance at which the beams of the shading fit pass the scene."""
-    return _Carried(tuple(poses), np.linalg.norm(alone.flashlights.positions - alone.flashlights.aim, axis=1))
 
 
 def _start(carried: _Carried, flashlights: Flashlights, offset: Float[np.ndarray, "3"] | None) -> Flashlights:

@@ -40,17 +40,19 @@ def fuse_shadow_lights(
     """
     by_name = {path.name: k for k, path in enumerate(stack.paths)}
     pixels = _around(stack, posed_camera, solids, _flash_levels(fit, stack, posed_camera))
+    ground = np.array([0, 0, posed_camera.ground_height])
     lights, used, apart = [], 0, []
     for light in fit.lights:
-        found = _of_photo(pixels, by_name[light.photo], solids, light, posed_camera) if light.used else None
-        if found is None or light.position is None:
+        at = light.position if light.used else None
+        found = None if at is None else fit_light(pixels, by_name[light.photo], solids, np.append(at - ground, 1.0))
+        if at is None or found is None:
             lights.append(light)
             continue
-        place = found.light[:3] + np.array([0, 0, posed_camera.ground_height])
-        mean, covariance, ratio = fuse([light.position, place], [np.diag(light.sigma**2), found.covariance])
+        place = found.light[:3] + ground
+        mean, covariance, ratio = fuse([at, place], [np.diag(light.sigma**2), found.covariance])
         reason = light.reason
         if disagree(ratio):
-            by = float(np.linalg.norm(light.position - place))
+            by = float(np.linalg.norm(at - place))
             reason = f"shading and the shadows of the declared objects place it {by:.0f} mm apart"
             apart.append(light.photo)
         lights.append(replace(light, position=mean, sigma=np.sqrt(np.diag(covariance)), reason=reason))
@@ -105,14 +107,6 @@ def _sun(photo: str, found: ShadowLight | None) -> Light:
     turn = (np.eye(3) - np.outer(direction, direction)) / length  # of the unit vector by the slopes
     sigma = np.sqrt(np.diag(turn @ found.covariance @ turn.T))
     return Light(photo, "directional", direction=direction, sigma=sigma)
-
-
-def _of_photo(
-    pixels: GroundPixels, photo: int, solids: tuple[Solid, ...], light: Light, posed_camera: PosedCamera
-) -> ShadowLight | None:
-    assert light.position is not None
-    start = np.append(light.position - np.array([0, 0, posed_camera.ground_height]), 1.0)
-    return fit_light(pixels, photo, solids, start)
 
 
 def _around(

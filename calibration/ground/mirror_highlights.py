@@ -98,7 +98,7 @@ def _brightest_spot(
         return None
     parts = [*(_around(smooth > level * height, top) for level in LEVELS), core]
     cut = [_share(_rim(part) & ~np.pad(valid, 1), _rim(part)) if part.sum() >= SMALLEST else 1.0 for part in parts]
-    if not (_rim(core) & _frame(core)).any():
+    if not (_rim(core) & np.pad(np.zeros_like(core), 1, constant_values=True)).any():
         for part, share in zip(parts, cut, strict=True):
             if share < (WHOLE + hidden if part is parts[0] else WHOLE):
                 return _Spot(_centroid(np.where(part, np.maximum(excess, 0), 0)), height, hidden)
@@ -135,10 +135,6 @@ def _rim(inside: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height_a
     """Return the pixels around a region, in a picture that has one more on each side."""
     padded = np.pad(inside, 1)
     return (cv2.dilate(padded.astype(np.uint8), SQUARE) > 0) & ~padded
-
-
-def _frame(inside: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height_and_2 width_and_2"]:
-    return np.pad(np.zeros_like(inside), 1, constant_values=True)
 
 
 def _share(some: np.ndarray, of: np.ndarray) -> float:

@@ -24,7 +24,7 @@ from scipy.ndimage import find_objects, gaussian_filter, label
 
 from calibration.ground.ground_field import DARK, DARKEST, GroundField, Maps
 from calibration.ground.min_cut import cheapest_region
-from capture.checks.robust import column_spread, spread
+from capture.checks.robust import column_spread, lower_median, spread
 
 POOLED = 1.5  # px, sigma of the window whose samples tell a level part's step together
 STEP = 0.1  # log units: usual step of a level part, as high as a 20th of the light's distance
@@ -62,8 +62,7 @@ class ObjectAndGround:
     region: Region  # no ground: the object, and whatever else is none
     brightness: Map  # mean over photos of the log likelihood ratio, object over open ground, of brightness alone
     odds: Map  # nats, object over ground, of the pixel by itself
-    gaps: Region  # ground in a gap, in shadow in most photos
-    albedo: Map  # log, of the ground: there that of the ground around
+    albedo: Map  # log, of the ground: in a gap, in shadow in most photos, that of the ground around
 
 
 def object_and_ground(
@@ -83,7 +82,7 @@ def object_and_ground(
     worth = _worth(single, samples.lit)
     told = count >= FEWEST_PHOTOS
     by_light, links = np.where(told, np.clip(worth * mean, -SURE, SURE), 0), _links(field)
-    odds, gaps, albedo = by_light, np.zeros_like(told), field.albedo
+    odds, albedo = by_light, field.albedo
     region = _cut(odds, links)
     for _ in range(ROUNDS):
         thing = shadowed_inside(field, region)
@@ -100,11 +99,11 @@ def object_and_ground(
         if not (after := _cut(either, links)).any():  # a gap lies beside an object: not all of it is one
             break
         shaded = ((field.residual + field.albedo - near[..., 0] < DARK) & usable).sum(0) >= count / 2
-        gaps, odds, region = (beside > 0) & (in_gap < 0) & shaded, either, after
-        albedo = np.where(gaps, near[..., 0], field.albedo)
+        odds, region = either, after
+        albedo = np.where((beside > 0) & (in_gap < 0) & shaded, near[..., 0], field.albedo)
         if (region == before).all():
             break
-    return ObjectAndGround(region, mean.astype(np.float32), odds, gaps & ~region, albedo)
+    return ObjectAndGround(region, mean.astype(np.float32), odds, albedo)
 
 
 def witness_odds(witness: Witness, region: Region) -> Map:
@@ -280,9 +279,7 @@ def _medians(colour: np.ndarray, where: Bool[np.ndarray, "photos height width"],
 
 def _median(values: Maps, known: Bool[np.ndarray, "photos height width"]) -> Map:
     """Return the lower median over the photos that know a pixel; 0 where none does."""
-    ordered, count = np.sort(np.where(known, values, np.inf), axis=0), known.sum(0)
-    middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[None] // 2, 0)[0]
-    return np.where(count > 0, middle, 0).astype(np.float32)
+    return np.nan_to_num(lower_median(np.where(known, values, np.float32(np.nan)), 0)).astype(np.float32)
 
 
 def _links(field: GroundField) -> list[np.ndarray]:

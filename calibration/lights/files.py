@@ -46,7 +46,7 @@ class GivenLights:
     lights: tuple[Light, ...]
     has_power: bool  # else every power is 1, to be estimated from the photos
     beam: tuple[float, ...] = ()
-    ambient: Vector | None = None
+    ambient: Vector | None = None  # None: all but a calibration.json of ours, which brings a camera, too
     notes: tuple[str, ...] = ()
     unit: str = ""  # of places, where the file names one
     is_by_number: bool = False  # matched by the numbers in the photos' names, of a list that is longer
@@ -94,12 +94,6 @@ def is_number_list(path: Path) -> bool:
     """
     suffix = path.suffix.lower()
     return suffix in (".mat", ".npy") or (suffix != ".npz" and not read_text(path).lstrip().startswith("{"))
-
-
-def is_calibration(path: Path) -> bool:
-    """Return True for a calibration.json of ours, which brings a camera."""
-    content = read_json(path) if path.suffix.lower() == ".json" else {}
-    return "format" in content and "camera" in content
 
 
 def read_opinions(path: Path) -> tuple[Light, ...] | None:

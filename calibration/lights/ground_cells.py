@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from calibration.ground.ground_field import GroundField, fit_ground_field
 from calibration.ground.table_edges import TableEdge, find_table_edges, on_table
 from calibration.lights import hand
 from calibration.posed_camera import PosedCamera
@@ -60,12 +61,21 @@ def ground_ends(
     return find_table_edges(stack.rgb[usable], ~stack.clipped[usable], points, posed_camera.centre)
 
 
-def beyond_ends(
-    edges: Sequence[TableEdge], posed_camera: PosedCamera, shape: tuple[int, ...]
-) -> Bool[np.ndarray, "height width"] | None:
-    """Return the pixels of a picture (its height, width) that show what lies beyond the edges; None without edges."""
-    points, down = ground_points(posed_camera.resized(shape[1], shape[0]))
-    return ~(on_table(edges, points) & down) if edges else None
+def field_of(
+    stack: PhotoStack,
+    posed_camera: PosedCamera,
+    usable: Bool[np.ndarray, " photos"],
+    edges: Sequence[TableEdge] | None = None,
+) -> GroundField:
+    """Fit the ground's field to these photos of the stack; what lies beyond the ground's ends gets one of its own.
+
+    Args:
+        edges: as ground_ends finds them; None: they are found.
+    """
+    edges = ground_ends(stack, posed_camera, usable) if edges is None else edges
+    points, down = ground_points(posed_camera.resized(stack.rgb.shape[2], stack.rgb.shape[1]))
+    beyond = ~(on_table(edges, points) & down) if edges else None
+    return fit_ground_field(stack.rgb[usable], ~stack.clipped[usable], beyond)
 
 
 def _cell_of_pixel(

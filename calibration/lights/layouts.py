@@ -143,18 +143,34 @@ def rigid(matrix: Any, file: str, name: str) -> Pose:
     raise CalibrationError(f"{file}: {name} is not a 4 x 4 matrix of rotation and translation; export it again.")
 
 
-def shadowneus_real_rows(path: Path, posed_camera: PosedCamera) -> Rows:
-    """ShadowNeuS' params.npz of real photos: light_pose, camera_pose (OpenCV axes), floor_height.
+def read_params(
+    path: Path, *more: str
+) -> tuple[Float[np.ndarray, "photos 3"], Pose, float, dict[str, Float[np.ndarray, "..."]]]:
+    """Return the lights' places, the camera (OpenCV axes) and the floor's height of ShadowNeuS' params.npz.
+
+    Args:
+        more: further arrays that are needed; all are returned by name.
 
     Raises:
-        CalibrationError: a member is missing, of the wrong shape, or too large.
+        CalibrationError: an array is missing, of the wrong shape, or too large.
     """
-    content = read_npz(path, ("light_pose", "camera_pose", "floor_height"))
-    light, camera, floor = content["light_pose"], content["camera_pose"], content["floor_height"]
-    if light.ndim != 3 or light.shape[1:] != (4, 4) or not np.isfinite(light).all() or floor.size != 1:
+    content = read_npz(path, ("light_pose", "camera_pose", "floor_height", *more))
+    light, floor = content["light_pose"], content["floor_height"]
+    if light.ndim != 3 or light.shape[1:] != (4, 4) or not np.isfinite(light).all():
         raise CalibrationError(f"{path}: light_pose has the shape {light.shape}, N x 4 x 4 finite numbers were needed.")
-    pose, height = rigid(camera, str(path), "camera_pose"), float(floor.reshape(()))
-    values = _placed(light[:, :3, 3], pose, height, posed_camera, str(path))
+    if floor.size != 1 or not np.isfinite(floor).all():
+        raise CalibrationError(f"{path}: floor_height holds {floor.size} numbers, one finite one was needed.")
+    return light[:, :3, 3], rigid(content["camera_pose"], str(path), "camera_pose"), float(floor.reshape(())), content
+
+
+def shadowneus_real_rows(path: Path, posed_camera: PosedCamera) -> Rows:
+    """ShadowNeuS' params.npz of real photos.
+
+    Raises:
+        CalibrationError: as read_params.
+    """
+    places, pose, height, _ = read_params(path)
+    values = _placed(places, pose, height, posed_camera, str(path))
     return Rows((None,) * len(values), values, "point", first=0)
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from calibration.light import Light, Vector
 from calibration.posed_camera import PosedCamera
@@ -31,29 +31,19 @@ EDGE_PX, CENTROID = 0.5, 0.2  # one sigma: of the circle, px; of a highlight's m
 
 
 @dataclass(frozen=True)
-class Ball:
-    """The circle of a ball in the photos, px of the full photo, pixel centres at whole numbers."""
+class Circle:
+    """A ball or a highlight in a picture, px; pixel centres at whole numbers."""
 
     x: float
     y: float
     radius: float
 
-    def covers(self, width: int, height: int, grown: float = GROWN) -> Bool[np.ndarray, "height width"]:
-        """Return the pixels of the full photo that show the ball and a rim about it."""
-        v, u = np.mgrid[:height, :width]
-        return (u - self.x) ** 2 + (v - self.y) ** 2 <= (grown * self.radius) ** 2
+    def enlarged(self, scale: float) -> "Circle":
+        """Return the circle in a picture `scale` times as large."""
+        return Circle((self.x + 0.5) * scale - 0.5, (self.y + 0.5) * scale - 0.5, self.radius * scale)
 
 
-@dataclass(frozen=True)
-class Highlight:
-    """A highlight's middle, px of the picture, and its radius."""
-
-    x: float
-    y: float
-    radius: float
-
-
-def find_ball(stack: PhotoStack) -> Ball | None:
+def find_ball(stack: PhotoStack) -> Circle | None:
     """Return the ball: the best circle of mean or brightest picture with one small highlight that moves; else None.
 
     Args:
@@ -70,10 +60,10 @@ def find_ball(stack: PhotoStack) -> Ball | None:
                 best, score = circle, found
     if best is None:
         return None
-    return Ball((best.x + 0.5) * scale - 0.5, (best.y + 0.5) * scale - 0.5, best.radius * scale)
+    return best.enlarged(scale)
 
 
-def lights_of(stack: PhotoStack, ball: Ball, posed_camera: PosedCamera) -> tuple[Light, ...]:
+def lights_of(stack: PhotoStack, ball: Circle, posed_camera: PosedCamera) -> tuple[Light, ...]:
     """Return a directional light (world) for each photo, with its sigma (radians); without a highlight it is unused.
 
     Args:
@@ -81,7 +71,7 @@ def lights_of(stack: PhotoStack, ball: Ball, posed_camera: PosedCamera) -> tuple
     """
     grey = _greys(stack, max(stack.rgb.shape[1:3]))
     scale = stack.full_width / grey.shape[2]
-    small = Ball((ball.x + 0.5) / scale - 0.5, (ball.y + 0.5) / scale - 0.5, ball.radius / scale)
+    small = Circle((ball.x + 0.5) / scale - 0.5, (ball.y + 0.5) / scale - 0.5, ball.radius / scale)
     lights = []
     for path, picture in zip(stack.paths, grey, strict=True):
         spot = highlight(picture, small)
@@ -90,13 +80,12 @@ def lights_of(stack: PhotoStack, ball: Ball, posed_camera: PosedCamera) -> tuple
             up = np.array([0.0, 0.0, 1.0])
             lights.append(Light(path.name, "directional", direction=up, used=False, reason=reason))
             continue
-        at = Highlight((spot.x + 0.5) * scale - 0.5, (spot.y + 0.5) * scale - 0.5, spot.radius * scale)
-        direction, sigma = reflected(at, ball, posed_camera)
+        direction, sigma = reflected(spot.enlarged(scale), ball, posed_camera)
         lights.append(Light(path.name, "directional", direction=direction, sigma=np.full(3, sigma)))
     return tuple(lights)
 
 
-def reflected(spot: Highlight, ball: Ball, posed_camera: PosedCamera) -> tuple[Vector, float]:
+def reflected(spot: Circle, ball: Circle, posed_camera: PosedCamera) -> tuple[Vector, float]:
     """Return the direction (world, unit) of the light that a highlight mirrors, and its sigma (radians, per axis).
 
     The ball's outline is taken as a circle about the ray to its middle, which holds where rays are nearly parallel.
@@ -115,7 +104,7 @@ def reflected(spot: Highlight, ball: Ball, posed_camera: PosedCamera) -> tuple[V
     return _unit(2 * (normal @ view) * normal - view), 2 * place / (ball.radius * depth)
 
 
-def highlight(picture: Float[np.ndarray, "height width"], ball: Ball) -> Highlight | None:
+def highlight(picture: Float[np.ndarray, "height width"], ball: Circle) -> Circle | None:
     """Return the one small bright spot within the ball's circle, px of the picture; None if there is none."""
     left, top = max(int(ball.x - ball.radius), 0), max(int(ball.y - ball.radius), 0)
     part = picture[top : int(ball.y + ball.radius) + 2, left : int(ball.x + ball.radius) + 2]
@@ -134,7 +123,7 @@ def highlight(picture: Float[np.ndarray, "height width"], ball: Ball) -> Highlig
         return None
     weight = np.where(spot, smooth - usual, 0)
     x, y = (float((weight * axis).sum() / weight.sum()) for axis in (u, v))
-    return Highlight(x + left, y + top, float(np.sqrt(spot.sum() / np.pi)))
+    return Circle(x + left, y + top, float(np.sqrt(spot.sum() / np.pi)))
 
 
 def _unit(vector: Vector) -> Vector:
@@ -147,7 +136,7 @@ def _greys(stack: PhotoStack, side: int) -> Float[np.ndarray, "photos height wid
     return np.stack([cv2.resize(rgb.mean(-1), size, interpolation=cv2.INTER_AREA) for rgb in stack.rgb])
 
 
-def _circles(picture: Float[np.ndarray, "height width"]) -> Sequence[Ball]:
+def _circles(picture: Float[np.ndarray, "height width"]) -> Sequence[Circle]:
     """Return circles of the picture by Hough's transform, the most likely first."""
     level = np.sqrt(picture / max(float(np.quantile(picture, 0.995)), 1e-9)).clip(0, 1)
     side = max(picture.shape)
@@ -157,10 +146,10 @@ def _circles(picture: Float[np.ndarray, "height width"]) -> Sequence[Ball]:
         image, cv2.HOUGH_GRADIENT, 1.5, least, param1=60, param2=22, minRadius=least, maxRadius=most
     )
     rows = [] if found is None else found.reshape(-1, found.shape[-1])[:TRIED]
-    return [Ball(float(x), float(y), float(r)) for x, y, r in (row[:3] for row in rows)]
+    return [Circle(float(x), float(y), float(r)) for x, y, r in (row[:3] for row in rows)]
 
 
-def _score(grey: Float[np.ndarray, "photos height width"], circle: Ball) -> float:
+def _score(grey: Float[np.ndarray, "photos height width"], circle: Circle) -> float:
     """Return how much a circle behaves as a shiny ball, 0 to 1: highlights that are small, in all photos, and move."""
     height, width = grey.shape[1:]
     if not (circle.radius < circle.x < width - circle.radius and circle.radius < circle.y < height - circle.radius):
@@ -178,7 +167,7 @@ def _score(grey: Float[np.ndarray, "photos height width"], circle: Ball) -> floa
     return len(spots) / len(grey) * roundness * (1 - size)
 
 
-def _edge(picture: Float[np.ndarray, "height width"], circle: Ball) -> tuple[Float[np.ndarray, "angles 2"], float]:
+def _edge(picture: Float[np.ndarray, "height width"], circle: Circle) -> tuple[Float[np.ndarray, "angles 2"], float]:
     """Return the strongest edge in each direction from the middle, px, and the share of them that lie on the circle."""
     turn = np.linspace(0, 2 * np.pi, ANGLES, endpoint=False)
     steps = circle.radius * np.linspace(1 - REACH, 1 + REACH, 41)
@@ -193,7 +182,7 @@ def _edge(picture: Float[np.ndarray, "height width"], circle: Ball) -> tuple[Flo
     return np.stack([circle.x + found * np.cos(turn), circle.y + found * np.sin(turn)], -1), share
 
 
-def _refined(grey: Float[np.ndarray, "photos height width"], circle: Ball, rounds: int = 3) -> Ball:
+def _refined(grey: Float[np.ndarray, "photos height width"], circle: Circle, rounds: int = 3) -> Circle:
     """Fit the circle to its edge in the mean picture: least squares, without the points that are far off."""
     for _ in range(rounds):
         points = _edge(grey.mean(0), circle)[0]
@@ -204,5 +193,5 @@ def _refined(grey: Float[np.ndarray, "photos height width"], circle: Ball, round
         radius = float(np.sqrt(max(rest + x * x + y * y, 1e-9)))
         if abs(radius / circle.radius - 1) > 2 * REACH:
             break
-        circle = Ball(float(x), float(y), radius)
+        circle = Circle(float(x), float(y), radius)
     return circle

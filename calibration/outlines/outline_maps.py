@@ -13,6 +13,7 @@ from calibration.ground.shadow_reach import most_height
 from calibration.lights.ground_cells import ground_points
 from calibration.outlines.metric_cues import MetricCues, ProvenSpace, proven_space
 from calibration.posed_camera import PosedCamera
+from calibration.side_view import signed_distance
 
 CELLS = 640  # of the map along each side
 REACH = 4.0  # of the object's size: how far from its foot shadows are looked at
@@ -86,7 +87,7 @@ def outline_maps(
     black = field.residual < DARK  # too dark to be measured, as a sharpened shadow's rim is, and yet surely dark
     known = bare & (field.usable | black) & (field.light > (bright - DIM)[:, None, None])
     corner, cell = foot[:2] - REACH * size, 2 * REACH * size / CELLS
-    look = _Lookup.over(camera, corner, cell)
+    look = _from_above(camera, corner, cell)
     sure = np.stack([look(one) > 0.99 for one in known])
     lit = np.stack([look(one) > LIT for one in shadows.visibility]) & sure
     dark = sure & ~lit
@@ -125,30 +126,18 @@ def with_cues(maps: OutlineMaps, cues: MetricCues, posed_camera: PosedCamera) ->
     return replace(maps, space=proven_space(cues, outline, top, posed_camera, PIXEL_ERROR * maps.pixel))
 
 
-@dataclass(frozen=True)
-class _Lookup:
-    """Pictures seen from above: the value of a picture at each cell of the map."""
+def _from_above(camera: PosedCamera, corner: Float[np.ndarray, "2"], cell: float):
+    """Return a function that gives the value of a picture at each cell of the map."""
+    along = cell * (np.arange(CELLS) + 0.5)
+    x, y = np.meshgrid(corner[0] + along, corner[1] + along, indexing="ij")
+    pixels, depth = camera.project_with_depth(np.stack([x, y, np.full_like(x, camera.ground_height)], -1))
+    pixels[depth <= 0] = -10
+    u, v = np.moveaxis(pixels.astype(np.float32), -1, 0)
 
-    pixels: Float[np.ndarray, "cells cells 2"]
+    def look(picture: np.ndarray) -> Float[np.ndarray, "cells cells"]:
+        return cv2.remap(np.ascontiguousarray(picture, np.float32), u, v, cv2.INTER_LINEAR, borderValue=0)
 
-    @staticmethod
-    def over(camera: PosedCamera, corner: Float[np.ndarray, "2"], cell: float) -> "_Lookup":
-        along = cell * (np.arange(CELLS) + 0.5)
-        x, y = np.meshgrid(corner[0] + along, corner[1] + along, indexing="ij")
-        pixels, depth = camera.project_with_depth(np.stack([x, y, np.full_like(x, camera.ground_height)], -1))
-        pixels[depth <= 0] = -10
-        return _Lookup(pixels.astype(np.float32))
-
-    def __call__(self, picture: np.ndarray) -> Float[np.ndarray, "cells cells"]:
-        values = np.ascontiguousarray(picture, np.float32)
-        return cv2.remap(values, self.pixels[..., 0], self.pixels[..., 1], cv2.INTER_LINEAR, borderValue=0)
-
-
-def signed_distance(inside: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
-    """Return the signed distance in cells: positive inside, negative outside, zero half way between the two."""
-    plus = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 5)
-    minus = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 5)
-    return np.where(inside, plus - 0.5, 0.5 - minus)
+    return look
 
 
 def _from_object(dark: Bool[np.ndarray, "cells cells"], behind: Bool[np.ndarray, "cells cells"]):

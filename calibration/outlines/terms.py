@@ -24,16 +24,14 @@ class OutlineTerms:
     maps: OutlineMaps
     eye: Float[np.ndarray, "3"]
     ground: float
-    used: Bool[np.ndarray, " photos"]  # of all photos of the maps: those of the fit
-    trusted: Bool[np.ndarray, " used"]  # of the fit's photos: the others neither prove space empty nor count
+    trusted: Bool[np.ndarray, " photos"]  # the others neither prove space empty nor count
     highlights: MirrorHighlights | None = None  # numbered as the maps' photos
     blur: float = 1.0  # factor of an outline's sigma, for a search that begins far from the answer
     every: int = 1  # one ray in so many is looked at, and counts for those left out
     _looks: list[tuple[np.ndarray, np.ndarray, Residuals]] = field(default_factory=list, init=False)
 
-    def rows(self, positions: Float[np.ndarray, "used 3"]):
-        """Return residuals in sigmas, Cauchy's weight applied, and derivatives (rows, used, 3) by the positions."""
-        order = self._order(len(positions))
+    def rows(self, positions: Float[np.ndarray, "photos 3"]):
+        """Return residuals in sigmas, Cauchy's weight applied, and derivatives (rows, photos, 3) by the positions."""
         found = self._look(positions, self.trusted)
         sigma = PIXEL_ERROR * self.maps.pixel * self.blur
         active = found.emptiness > 0
@@ -41,8 +39,8 @@ class OutlineTerms:
         root = np.sqrt(cauchy(size**2) * self.every / SAME)
         slopes = np.zeros((len(size), len(positions) + 1, 3))
         place = np.arange(len(size))
-        slopes[place, order[found.owner[active]]] += found.d_owner[active] * (root / sigma)[:, None]
-        slopes[place, order[np.maximum(found.by[active], 0)]] += found.d_by[active] * (root / sigma)[:, None]
+        slopes[place, found.owner[active]] += found.d_owner[active] * (root / sigma)[:, None]
+        slopes[place, np.maximum(found.by[active], 0)] += found.d_by[active] * (root / sigma)[:, None]
         arm, far = self._arms(positions)
         toward = np.zeros((len(positions), len(positions), 3))
         toward[np.arange(len(positions)), np.arange(len(positions))] = arm / (arm**2).sum(1, keepdims=True) / SERIES
@@ -60,28 +58,25 @@ class OutlineTerms:
         maps = replace(maps, starts=maps.starts[some], owner=maps.owner[some], first_height=first)
         return replace(self, maps=maps, every=every)
 
-    def misfit(self, positions: Float[np.ndarray, "used 3"]) -> Float[np.ndarray, " used"]:
+    def misfit(self, positions: Float[np.ndarray, "photos 3"]) -> Float[np.ndarray, " photos"]:
         """Return the 90th percentile of the emptiness of each photo's rays, px; 0 for a photo without rays.
 
         A photo that is not trusted is compared with the trusted ones.
         """
         misfit = np.zeros(len(positions))
-        own = np.flatnonzero(self.used)
         together = self._look(positions, self.trusted)
-        for number, photo in enumerate(own):
-            found = together
-            if not self.trusted[number]:
-                found = self._look(positions, self.trusted | (np.arange(len(own)) == number))
-            misfit[number] = found.misfit(int(photo)) / self.maps.pixel
+        for photo, one in enumerate(np.eye(len(positions)) > 0):
+            found = together if self.trusted[photo] else self._look(positions, self.trusted | one)
+            misfit[photo] = found.misfit(photo) / self.maps.pixel
         return np.nan_to_num(misfit, nan=0.0)
 
-    def cost(self, positions: Float[np.ndarray, "used 3"]) -> float:
+    def cost(self, positions: Float[np.ndarray, "photos 3"]) -> float:
         """Return half the sum of squares whose weighted rows `rows` gives: Cauchy's function."""
         found = self._look(positions, self.trusted)
         size = np.maximum(found.emptiness, 0) / (PIXEL_ERROR * self.maps.pixel * self.blur)
         return float(np.log1p(size**2).sum() * self.every / (2 * SAME)) + self.other_cost(positions)
 
-    def other_cost(self, positions: Float[np.ndarray, "used 3"]) -> float:
+    def other_cost(self, positions: Float[np.ndarray, "photos 3"]) -> float:
         """Half the sum of squares of unusual distances, and Geman and McClure's function of highlights.
 
         That is bounded: a third of the spots that are seen, or all on a matt table, are no highlights, and one must not
@@ -91,28 +86,20 @@ class OutlineTerms:
         spots = (miss / (1 + miss / FALSE_SPOT**2)).sum()
         return float(0.5 * (self._arms(positions)[1] ** 2).sum() + 0.5 * spots)
 
-    def _order(self, count: int):
-        """Return the place in the fit of each of the maps' photos; `count` for photos that are not in it."""
-        order = np.full(len(self.used) + 1, count)
-        order[np.flatnonzero(self.used)] = np.arange(count)
-        return order
-
-    def _arms(self, positions: Float[np.ndarray, "used 3"]):
+    def _arms(self, positions: Float[np.ndarray, "photos 3"]):
         """Return vectors from the foot to the lights, and how unusual their lengths are in this series, in sigmas."""
         arm = positions - self.maps.foot
         log_distance = np.log(np.linalg.norm(arm, axis=1))
         return arm, (log_distance - np.median(log_distance)) / SERIES
 
-    def _half_vectors(self, positions: Float[np.ndarray, "used 3"]):
+    def _half_vectors(self, positions: Float[np.ndarray, "photos 3"]):
         """Return how far the half vector at each highlight leans from the ground's normal, in sigmas: (spots, 2).
 
         Also returns derivatives (spots, 2, 3) by the light's position, and whose light it is.
         """
-        if self.highlights is None or not len(self.highlights):
+        if self.highlights is None:
             return np.zeros((0, 2)), np.zeros((0, 2, 3)), np.zeros(0, int)
-        owner = self._order(len(positions))[self.highlights.photos]
-        inside = owner < len(positions)
-        owner, points, sigma = owner[inside], self.highlights.points[inside], self.highlights.sigma[inside]
+        owner, points, sigma = self.highlights.photos, self.highlights.points, self.highlights.sigma
         to_light, to_eye = positions[owner] - points, self.eye - points
         distance = np.linalg.norm(to_light, axis=1)
         light, eye = to_light / distance[:, None], to_eye / np.linalg.norm(to_eye, axis=1, keepdims=True)
@@ -122,12 +109,9 @@ class OutlineTerms:
         slope = turn @ (np.eye(3) - light[:, :, None] * light[:, None]) / (total * distance)[:, None, None]
         return half[:, :2] / sigma[:, None], slope[:, :2] / sigma[:, None, None], owner
 
-    def _look(self, positions: Float[np.ndarray, "used 3"], takes_part: Bool[np.ndarray, " used"]) -> Residuals:
+    def _look(self, positions: Float[np.ndarray, "photos 3"], takes_part: Bool[np.ndarray, " photos"]) -> Residuals:
         lift = np.array([0.0, 0.0, self.ground])
-        lights, used = np.ones((len(self.used), 3)), self.used.copy()
-        lights[self.used] = positions - lift
-        used[self.used] = takes_part
-        used &= self.maps.is_outlined()
+        lights, used = positions - lift, takes_part & self.maps.is_outlined()
         for before, at, found in self._looks:  # cost and rows of one state, one after the other
             if np.array_equal(before, used) and np.array_equal(at, lights):
                 return found

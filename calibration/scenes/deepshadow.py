@@ -71,8 +71,7 @@ def load_deepshadow(folder: Path) -> KnownScene:
         rgb_paths=None,
         shadow_paths=shadow,
         mask_path=None if is_blank else mask,
-        photos_left_out=usable.left_out,
-        every_photo=usable.every,
+        photos=usable,
         mask_is_grey=True,
         ground_known=False,
     )

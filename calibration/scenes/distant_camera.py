@@ -143,6 +143,5 @@ def distant_scene(
         is_linear=shading.is_linear,
         dark_paths=tuple(dark),
         notes=(*notes, *shading.notes, SCALE_NOTE),
-        photos_left_out=photos.left_out,
-        every_photo=photos.every,
+        photos=photos,
     )

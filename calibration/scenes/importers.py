@@ -82,7 +82,7 @@ def import_folder(folder: Path, split: str, out: Path) -> tuple[Importer, KnownS
             "import: `shadowgraph run` reads it."
         )
     scene = importer.load(folder, split)
-    if scene.photos_left_out:
-        scene = replace(scene, notes=(*scene.notes, f"left out: {grouped(scene.photos_left_out)}"))
+    if scene.photos.left_out:
+        scene = replace(scene, notes=(*scene.notes, f"left out: {grouped(scene.photos.left_out)}"))
     save_scene(scene, importer.layout, out)
     return importer, scene

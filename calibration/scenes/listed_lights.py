@@ -20,11 +20,11 @@ import numpy as np
 from calibration.calibration import Calibration, load_calibration
 from calibration.known_scene import Importer, KnownScene
 from calibration.light import Light
-from calibration.lights.files import GivenLights, NoMatchError, is_calibration, is_number_list, read_lights
+from calibration.lights.files import GivenLights, NoMatchError, is_number_list, read_lights
 from calibration.lights.layouts import view_note
 from calibration.lights.number_lists import number_rows
 from calibration.lights.photo_lists import dark_photos, folders_of, match, photos_in
-from calibration.lights.shiny_ball import GROWN, Ball, find_ball, lights_of
+from calibration.lights.shiny_ball import GROWN, Circle, find_ball, lights_of
 from calibration.posed_camera import PosedCamera
 from calibration.scenes.distant_camera import distant_light, distant_scene, picture_camera
 from capture.decode.formats import read_size
@@ -67,7 +67,7 @@ def load_with_ball(folder: Path, circle: tuple[float, float, float] | None) -> K
     usable = scene_photos(photos)
     posed_camera, camera_note = picture_camera(usable.paths)
     stack = read_stack(usable.paths, LONG_SIDE)
-    ball = find_ball(stack) if circle is None else Ball(*circle)
+    ball = find_ball(stack) if circle is None else Circle(*circle)
     if ball is None:
         return None
     inside = 0 <= ball.x < stack.full_width and 0 <= ball.y < stack.full_height
@@ -162,7 +162,7 @@ def load_listed(folder: Path, source: Path) -> KnownScene:
     posed_camera, camera_note = picture_camera(usable.paths)
     given = read_lights(source, [path.name for path in usable.paths], posed_camera, usable.every)
     note = f"lights: from {source.name}, for each of {len(usable.paths)} photos and none of a board"
-    if is_calibration(source):
+    if given.ambient is not None:
         return _with_its_camera(usable, load_calibration(source), given, note)
     lights = _in_front(given.lights, given.unit, posed_camera, source)
     notes, dark = (note, *given.notes, camera_note), dark_photos(folder, photos)
@@ -265,8 +265,7 @@ def _with_its_camera(photos: ScenePhotos, own: Calibration, given: GivenLights, 
         mask if mask.is_file() else None,
         mask_is_grey=True,
         notes=(note, "camera and ground: from the same file"),
-        photos_left_out=photos.left_out,
-        every_photo=photos.every,
+        photos=photos,
     )
 
 

@@ -68,8 +68,7 @@ def _load(folder: Path, split: str) -> KnownScene:
         is_linear=given.linear,
         dark_paths=tuple(photos_in(folder / DARK)),
         notes=given.notes,
-        photos_left_out=usable.left_out,
-        every_photo=tuple(names),
+        photos=usable,
     )
 
 

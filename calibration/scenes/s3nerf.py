@@ -20,10 +20,9 @@ from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.known_scene import Importer, KnownScene
 from calibration.light import Light
-from calibration.lights.known_ground import find_ground_height, preview
 from calibration.lights.layouts import lamps
 from calibration.lights.photo_lists import photos_in
-from calibration.lights.power import with_common_power
+from calibration.lights.power import find_ground_height, preview, with_common_power
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.scenes.distant_camera import LOOKING_DOWN
@@ -105,8 +104,7 @@ def _load(folder: Path, split: str) -> KnownScene:
         ground_known=found is not None,
         is_linear=True,
         notes=tuple(filter(None, (given.note, found, "photos: pixel values are linear, as in this layout"))),
-        photos_left_out=usable.left_out,
-        every_photo=usable.every,
+        photos=usable,
     )
 
 

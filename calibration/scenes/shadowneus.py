@@ -1,6 +1,11 @@
 """Scenes that come with their camera, ground and lights: the layout of ShadowNeuS, NeRF-synthetic plus light poses.
 
 Uneven ground of such a scene: a depth map of the bare ground, on the grid of the photos.
+
+Photographs in its layout: params.npz, image/ and mask.png. `light_pose` (N x 4 x 4, of the phone that held the light),
+`camera_pose` (OpenCV axes), `camera_intrinsics` (pixel centres at +0.5), `floor_height`; world z is up. The lights
+stand where that phone's camera was. mask.png is white where the object is or may be, so it is no silhouette: the
+outline is found from the photos.
 """
 
 from collections.abc import Sequence
@@ -16,11 +21,12 @@ from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.known_scene import Importer, KnownScene
 from calibration.light import Light
-from calibration.lights.known_ground import shading_misfit
-from calibration.lights.layouts import FROM_BLENDER, Floor, Frame, Frames
-from calibration.lights.power import with_common_power
+from calibration.lights.layouts import FROM_BLENDER, Floor, Frame, Frames, read_params
+from calibration.lights.photo_lists import photos_in
+from calibration.lights.power import LONG_SIDE, preview, shading_misfit, with_common_power
 from calibration.pose import Pose
 from capture.decode.exr import read_exr
+from capture.decode.formats import read_size
 from capture.errors import CalibrationError
 from capture.files.arrays import read_npy
 from capture.files.names import inside
@@ -28,7 +34,6 @@ from capture.files.schema import read_scene
 from capture.photos.photo import read_photo, read_stack
 from capture.session.sorting import scene_photos
 
-PREVIEW_LONG_SIDE = 128  # px: enough for one number per scene (kind of light, power)
 SAME_CAMERA_TOLERANCE = 1e-4  # scene units or unit vectors: exporters round to six digits
 SHADOW_PICTURE_SHARE = 0.98  # of the pixels are black or white in a picture of shadows
 PATTERN = "floor/*_depth_*"  # of the authors' bumpy scenes
@@ -36,6 +41,8 @@ LARGEST_DEPTH = 2**30  # bytes: float64 of 130 megapixels
 KINDS = (".exr", ".npy")
 FEWEST_KNOWN = 0.02  # of the picture: with less ground nothing can be bounded by shadows on it
 NOTHING = 1e6  # renderers write 1e10 or so where they hit nothing
+PHOTOGRAPHS, MASK, INTRINSICS = "image", "mask.png", "camera_intrinsics"
+TRAIN = "train"
 
 
 class _Kind(Struct):
@@ -83,7 +90,7 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
         if is_shadow_only:
             raise CalibrationError(f"{source}: shadow pictures of several lights at once; one light each is needed.")
         shadow_paths = None  # they do not show which of the lights is hidden
-    stack = read_stack(pictures, PREVIEW_LONG_SIDE)
+    stack = read_stack(pictures, LONG_SIDE)
     focal = stack.full_width / 2 / np.tan(description.camera_angle_x / 2)
     camera = Camera.centred(stack.full_width, stack.full_height, focal)
     world_from_camera = _fixed_camera(frames, source)
@@ -107,8 +114,7 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
         tuple(shadow_paths) if shadow_paths else None,
         mask if mask.is_file() else None,
         ground_depth_path=find_ground_depth(folder),
-        photos_left_out=usable.left_out,
-        every_photo=usable.every,
+        photos=usable,
     )
 
 
@@ -206,3 +212,74 @@ def read_ground_depth(path: Path, camera: Camera) -> Float[np.ndarray, "height w
             "were needed. It must hold the z-depth of the bare ground in the unit of the scene."
         )
     return np.where(known, depth, np.nan)
+
+
+# --- photographs: params.npz -----------------------------------------------------------------------------------------
+
+
+def _has_photographs(folder: Path) -> str | None:
+    files = sorted(folder.glob("params*.npz"))
+    is_one = bool(files) and bool(photos_in(folder / PHOTOGRAPHS))
+    return f"{files[0].name} and {PHOTOGRAPHS}/" if is_one else None
+
+
+def _load_photographs(folder: Path, split: str) -> KnownScene:
+    """Load camera, ground, point lights (world) and photos.
+
+    Args:
+        split: "train" reads params.npz where there is no params_train.npz.
+
+    Raises:
+        CalibrationError, CaptureError: an array is missing or impossible, or does not fit the photos.
+    """
+    source = folder / f"params_{split}.npz"
+    if split == TRAIN and not source.is_file():
+        source = folder / "params.npz"
+    places, pose, height, content = read_params(source, INTRINSICS)
+    photos = photos_in(folder / PHOTOGRAPHS)
+    if len(photos) != len(places):
+        raise CalibrationError(
+            f"{source}: light_pose gives {len(places)} lights and {folder / PHOTOGRAPHS} holds {len(photos)} photos; "
+            "as many were needed, in the same order."
+        )
+    usable = scene_photos(photos)
+    photos, places = usable.paths, places[usable.rows]
+    camera = _stated_camera(content[INTRINSICS], read_size(photos[0]), source)
+    low = [path.name for path, place in zip(photos, places, strict=True) if place[2] <= height]
+    if pose.translation[2] <= height or low:
+        raise CalibrationError(
+            f"{source}: floor_height {height:g} lies above {f'the light of {low[0]}' if low else 'the camera'}; a "
+            "floor below it was needed (world z is up)."
+        )
+    lights = [Light(path.name, "point", position=place) for path, place in zip(photos, places, strict=True)]
+    calibration = Calibration(camera, pose, height, tuple(lights), unit="scene")
+    notes = ["lights: assumed at the camera of the phone that held them"]
+    if (folder / MASK).is_file():
+        notes.append(f"{MASK}: not used, it marks all possible object pixels; the outline is found from the photos")
+    return KnownScene(
+        with_common_power(calibration, preview(photos)),
+        tuple(photos),
+        None,
+        None,
+        notes=tuple(notes),
+        photos=usable,
+    )
+
+
+def _stated_camera(intrinsics: np.ndarray, size: tuple[int, int], source: Path) -> Camera:
+    is_matrix = intrinsics.shape in ((3, 3), (4, 4)) and np.isfinite(intrinsics).all()
+    if not is_matrix or min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
+        raise CalibrationError(
+            f"{source}: camera_intrinsics has the shape {intrinsics.shape}, a 4 x 4 matrix with positive focal lengths "
+            "was needed."
+        )
+    fx, fy, cx, cy = (float(intrinsics[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    if not (0 < cx < size[0] and 0 < cy < size[1]):
+        raise CalibrationError(
+            f"{source}: camera_intrinsics puts the optical axis at ({cx:g}, {cy:g}), outside the photos of {size[0]} x "
+            f"{size[1]} pixels; the intrinsics of these photos were needed."
+        )
+    return Camera(*size, fx, fy, cx - 0.5, cy - 0.5)
+
+
+OF_PHOTOGRAPHS = Importer("ShadowNeuS, photographs (params.npz)", _has_photographs, _load_photographs)

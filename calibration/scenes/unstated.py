@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from calibration.light import Light
-from calibration.lights.known_ground import LONG_SIDE, preview
 from calibration.lights.lambert import (
     EXPLAINED,
     LIT_SHARE,
@@ -24,6 +23,7 @@ from calibration.lights.lambert import (
     lambert,
     relative_misfit,
 )
+from calibration.lights.power import LONG_SIDE, preview
 from capture.decode.formats import states_curve
 from capture.photos.photo import PhotoStack, read_stack, srgb_of
 from capture.photos.radiometry import without_ambient

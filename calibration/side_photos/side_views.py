@@ -17,10 +17,9 @@ from jaxtyping import Bool, Float
 from calibration.board.board import Board
 from calibration.board.board_pose import SAME_LENS, best_view, pose_covariance, reprojected
 from calibration.board.corners import Corners, find_board, grey_of
-from calibration.ground.ground_field import fit_ground_field
 from calibration.ground.ground_shadows import find_shadows
 from calibration.ground.shadow_reach import NEAREST, most_height
-from calibration.lights.ground_cells import beyond_ends, ground_ends, ground_points
+from calibration.lights.ground_cells import field_of, ground_points
 from calibration.outlines.metric_cues import MetricCues
 from calibration.posed_camera import PosedCamera
 from calibration.side_photos.ground_look import TripodView, stood_there
@@ -166,8 +165,7 @@ def metric_cues(
     if not session.board:
         reason = "the tripod took no photo in room light from this place, with which it could be compared"
         return known, [SideResult(path.name, None, reason) for path in session.side]
-    beyond = beyond_ends(ground_ends(stack, posed_camera, usable), posed_camera, stack.rgb.shape[1:3])
-    field = fit_ground_field(stack.rgb[usable], ~stack.clipped[usable], beyond)
+    field = field_of(stack, posed_camera, usable)
     lit = (field.albedo + field.light + field.residual).mean(0)
     seen = TripodObject(posed_camera, session.board[0], find_shadows(field).object_mask, lit)
     results = side_views(session.side, board, on_sheet, seen)

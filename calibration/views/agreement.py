@@ -22,10 +22,9 @@ from jaxtyping import Bool, Float
 from calibration.board.board import parse_board
 from calibration.calibrated_views import CalibratedView, CalibratedViews
 from calibration.calibration import Calibration
-from calibration.ground.ground_field import fit_ground_field
 from calibration.ground.ground_shadows import LIKELY, find_shadows
 from calibration.light import Vector
-from calibration.lights.ground_cells import beyond_ends, ground_ends
+from calibration.lights.ground_cells import field_of
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.photos.photo import PhotoStack
@@ -145,10 +144,7 @@ def agree(views: CalibratedViews, stacks: Sequence[PhotoStack]) -> CalibratedVie
 def silhouette_mask(stack: PhotoStack, calibration: Calibration) -> Bool[np.ndarray, "height width"]:
     """Return the object as the used photos show it against the ground, on a finer grid than the ground's field."""
     used = np.array([light.used for light in calibration.lights])
-    camera = calibration.posed_camera
-    beyond = beyond_ends(ground_ends(stack, camera, used), camera, stack.rgb.shape[1:3])
-    field = fit_ground_field(stack.rgb[used], ~stack.clipped[used], beyond)
-    shadows = find_shadows(field)
+    shadows = find_shadows(field_of(stack, calibration.posed_camera, used))
     height, width = shadows.object_mask.shape
     size = (FINER * width, FINER * height)
     near = cv2.dilate(shadows.object_mask.astype(np.uint8), np.ones((3, 3), np.uint8))

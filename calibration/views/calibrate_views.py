@@ -1,7 +1,7 @@
 """A capture becomes calibrated views: boards together, then each view's lights, then whether the views agree."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from calibration.board.board_photos import fit_boards
 from calibration.calibrate import calibrate
@@ -13,18 +13,12 @@ from capture.photos.photo import PhotoStack
 from capture.session.capture import Capture
 from capture.session.session import Session
 
-
-@dataclass(frozen=True)
-class ViewPhotos:
-    """The photos of one view under the flashlight, and what was found in them."""
-
-    stack: PhotoStack
-    findings: Sequence[Finding] = ()
+ViewPhotos = tuple[PhotoStack, Sequence[Finding]] | CaptureError  # under the flashlight, and what was found in them
 
 
 def calibrate_views(
     capture: Capture,
-    photos: Sequence[ViewPhotos | CaptureError],
+    photos: Sequence[ViewPhotos],
     board_spec: str | None = None,
     lights: str = "auto",
 ) -> CalibratedViews:
@@ -53,31 +47,28 @@ def calibrate_views(
 
 
 def _one_object_pose(
-    capture: Capture, photos: Sequence[ViewPhotos | CaptureError], board_spec: str | None, lights: str
+    capture: Capture, photos: Sequence[ViewPhotos], board_spec: str | None, lights: str
 ) -> CalibratedViews:
     """Calibrate the views between which nothing moved but the camera."""
     faults: list[tuple[str, CalibrationError | CaptureError]] = []
-    readable: list[tuple[Session, ViewPhotos]] = []
+    readable: list[tuple[Session, PhotoStack, Sequence[Finding]]] = []
     for session, own in zip(capture.views, photos, strict=True):
         if isinstance(own, CaptureError):
             faults.append((session.name, own))
         else:
-            readable.append((session, own))
+            readable.append((session, *own))
     if not readable:
         raise faults[0][1]
-    fits = fit_boards([session for session, _ in readable], capture.board, board_spec)
+    fits = fit_boards([one[0] for one in readable], capture.board, board_spec)
     found: list[CalibratedView] = []
     stacks: list[PhotoStack] = []
-    for (session, own), fit in zip(readable, fits, strict=True):
+    for (session, stack, findings), fit in zip(readable, fits, strict=True):
         try:
             if isinstance(fit, CalibrationError):
                 raise fit
-            found.append(
-                CalibratedView(
-                    session.name, calibrate(session, own.stack, board_spec, lights, own.findings, on_board=fit)
-                )
-            )
-            stacks.append(own.stack)
+            view = calibrate(session, stack, board_spec, lights, findings, on_board=fit)
+            found.append(CalibratedView(session.name, view))
+            stacks.append(stack)
         except (CalibrationError, CaptureError) as error:
             faults.append((session.name, error))
     if not found:

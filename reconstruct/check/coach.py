@@ -16,7 +16,7 @@ import numpy as np
 
 from calibration.board.board_photos import fit_board
 from calibration.board.recognise import board_finder
-from calibration.flashlight.fit import collect, first_guess, fit_flashlights
+from calibration.flashlight.fit import collect, first_fits, fit_flashlights
 from calibration.flashlight.model import Evidence, free_tangent
 from calibration.posed_camera import PosedCamera
 from capture.checks.check_stack import check_stack
@@ -235,7 +235,7 @@ class Coach:
         stack = self._first.stack(lit)
         evidence, photos = collect(stack, camera, np.ones(len(lit), bool))
         evidence = _thinned(evidence)
-        fit = fit_flashlights(first_guess(evidence), evidence, free_tangent)
+        fit = fit_flashlights(first_fits(evidence).best(), evidence, free_tangent)
         ways = fit.flashlights.positions - evidence.cells.centre
         azimuths = [from_the_camera(float(np.arctan2(y, x)), camera, evidence.cells.centre) for x, y, _ in ways]
         heights = np.degrees(np.arcsin(ways[:, 2] / np.linalg.norm(ways, axis=1)))

@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from calibration.ground.shadow_reach import shadow_reach
-from calibration.outlines.outline_maps import signed_distance
-from calibration.side_view import SideView
+from calibration.side_view import SideView, signed_distance
 from capture.errors import ReconstructionError
 from reconstruct.hull.hull_parts import (
     SURE,

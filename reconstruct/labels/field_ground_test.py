@@ -17,7 +17,7 @@ from torch.nn.functional import max_pool2d
 from calibration.ground.ground_field import DARK as SHADOW
 from calibration.ground.ground_field import DARKEST, GroundField, at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import LIKELY, BareGround, bare_ground
-from calibration.ground.table_edges import seen_beyond
+from calibration.ground.table_edges import find_table_edges, on_table
 from reconstruct.labels.ground_test import (
     NOISE_FLOOR,
     PIXELS_AT_ONCE,
@@ -81,7 +81,8 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     assert scene.rgb is not None
     rgb, usable = scene.rgb.numpy(), scene.usable.numpy()
     points, eye = ground_points(scene).double().numpy(), scene.eye.double().numpy()
-    beyond = seen_beyond(rgb, usable, points, eye)
+    edges = find_table_edges(rgb, usable, points, eye)
+    beyond = ~on_table(edges, points) if edges else None
     field = at_photo_size(fit_ground_field(rgb, usable, beyond), rgb, usable)
     whole = _with_dark_samples(field, usable)
     # Beyond the ground's end, too, light is smooth and shadows fall, but on no ground.

@@ -16,7 +16,7 @@ from calibration.calibrate_with_file import calibrate_with_file, scene_with_file
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
 from calibration.views.calibrate_views import ViewPhotos, calibrate_views
-from capture.errors import CalibrationError, CaptureError, ReconstructionError
+from capture.errors import CalibrationError, ReconstructionError
 from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.source.photos import Photos, within_plan
@@ -121,11 +121,11 @@ def _calibrated(source: Source, photos: Sequence[Photos], options: RunOptions) -
     return CalibratedViews.of(calibrate_with_file(source.session, stack, *named, photos[0].findings), photos[0].view)
 
 
-def _of_view(photos: Photos) -> ViewPhotos | CaptureError:
+def _of_view(photos: Photos) -> ViewPhotos:
     if photos.error is not None:
         return photos.error
     assert photos.stack is not None
-    return ViewPhotos(photos.stack, photos.findings)
+    return photos.stack, photos.findings
 
 
 def with_ground(calibration: Calibration, option: str, is_known: bool, has_scale: bool = False) -> Calibration:

@@ -229,7 +229,7 @@ def _photos_of_scene(known: KnownScene, options: RunOptions, kept: Path | None, 
             stack = without_ambient(stack, dark)
     path = known.ground_depth_path if options.ground == AUTO else None
     ground_depth = None if path is None else read_ground_depth(path, known.calibration.camera)
-    return Photos(stack, known.photos_left_out, shadow, mask, ground_depth=ground_depth, plan=plan)
+    return Photos(stack, known.photos.left_out, shadow, mask, ground_depth=ground_depth, plan=plan)
 
 
 def _without_left_out(photos: Photos, known: KnownScene) -> Photos:

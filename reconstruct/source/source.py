@@ -177,7 +177,7 @@ class Source:
     def left_out(self) -> tuple[Finding, ...]:
         """The photos that cannot be read or have another size than the rest, and the copies of a capture's."""
         if self.capture is None:
-            return () if self.known is None else self.known.photos_left_out
+            return () if self.known is None else self.known.photos.left_out
         sessions = self.capture.sessions()
         return tuple(one for session in sessions for one in session.left_out)
 
