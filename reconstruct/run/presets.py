@@ -7,7 +7,7 @@ from reconstruct.shadowneus.config import TrainConfig, Weights, ablated, shorten
 from reconstruct.solve.solver import FitConfig, Level
 from reconstruct.source.source import LONG_SIDES, RunOptions
 
-DRAFT_LEVELS = (Level(48, 24, (0.5, 0.4), 4, 4.2e-4), Level(96, 24, (0.4, 0.15), 3, 4.2e-4))
+DRAFT_LEVELS = (Level(40, 24, (0.5, 0.4), 4, 4.2e-4), Level(72, 24, (0.4, 0.15), 3, 4.2e-4))
 FINE_NODES = 240  # along the object: about one voxel per pixel of an object that fills a third of the picture
 
 

@@ -25,7 +25,7 @@ from reconstruct.sdf.rays import first_hits
 
 BAND = 3.0  # voxels about the surface in which nodes move: differences are taken within 2.4 of it
 ON_SURFACE = 1.0  # voxels: nodes that are held to where they are
-HELD = 0.12 / 0.5  # weight of that, beside a sure normal: that is right to .12 rad, a position to half a voxel
+HELD = 0.1  # weight of that, beside a sure normal's 1: positions decide beyond some 2 pi / HELD voxels
 AT_REST = 1.0  # the same where no normal is near; a tenth of it moves a hidden side by .001 voxels more
 AT_OUTLINE = 1.0  # the same for the points of pixels at an outline, whose place is seen itself
 ALIKE = 0.1  # weight of the differences of neighbours' moves: what no normal tells moves with what is near
