@@ -145,6 +145,18 @@ def test_the_inside_of_a_cup_is_found_under_a_lid_that_touches_its_near_rim_only
     assert np.nanmedian(np.abs(found - length)[side & ~inside & ~top]) < 0.5
 
 
+def test_a_side_stays_on_its_hull_though_all_its_normals_err_alike():
+    """Above a white table a wall seems to face down; it is as true to its hull in a large picture as in a small one."""
+    u, v = np.meshgrid(np.linspace(-0.01, 0.01, 8), np.linspace(-0.25, 0.25, 200))
+    along = np.stack([u, np.ones_like(u), v], -1) / np.sqrt(1 + u**2 + v**2)[..., None]
+    wall = 300 / along[..., 1]
+    own = np.broadcast_to([0.0, -1.0, 0.0], along.shape)
+    down = np.radians(10.0)
+    seeming = np.broadcast_to([0.0, -np.cos(down), -np.sin(down)], along.shape)
+    found = integrate_within(along, wall, own, seeming, np.full(wall.shape, SURE))
+    assert np.abs(found - wall).max() < 3 * 300 * 0.5 / 199  # three pixels
+
+
 def test_what_is_in_front_of_a_hull_weighs_more(block):
     along, length, normals = rays_and_lengths(*block)
     uneven = length + np.where(np.arange(length.shape[1]) % 2 > 0, 2.0, -2.0)
