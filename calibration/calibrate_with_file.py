@@ -16,14 +16,14 @@ from calibration.light import Light
 from calibration.lights.files import GivenLights, read_lights, read_opinions
 from calibration.lights.fusion import disagree, fuse
 from calibration.lights.photo_lists import bare
-from calibration.lights.power import LONG_SIDE, on_albedo_scale, with_common_power, with_power_per_photo
+from calibration.lights.power import on_albedo_scale, with_common_power, with_power_per_photo
 from calibration.posed_camera import PosedCamera
 from calibration.reframed import reframed
 from calibration.side_photos.side_views import metric_cues, side_notes
 from capture.errors import CalibrationError
 from capture.files.names import natural_order
 from capture.photos.finding import Finding
-from capture.photos.photo import PhotoStack, reduced
+from capture.photos.photo import PhotoStack
 from capture.session.session import Session
 
 IN_OBJECT = 0.2  # of the camera's distance from what it looks at: a lamp nearer to that stands in the object
@@ -125,7 +125,7 @@ def scene_with_file(scene: KnownScene, stack: PhotoStack | None, path: Path) -> 
     ambient = own.ambient if given.ambient is None else given.ambient
     lit = replace(own, lights=given.lights, beam=given.beam, ambient=ambient)
     if not given.has_power and stack is not None:
-        lit = with_common_power(lit, reduced(stack, LONG_SIDE))
+        lit = with_common_power(lit, stack)
     notes = [*own.residuals.get("notes", []), f"lights: from {path}", *given.notes]
     return replace(lit, residuals=own.residuals | {"notes": notes})
 

@@ -65,9 +65,8 @@ def on_albedo_scale(calibration: Calibration, stack: PhotoStack) -> Calibration:
     used = tuple(light for light in calibration.lights if light.used)
     if not used:
         return calibration
-    scale = _power_scale(replace(calibration, lights=used), reduced(stack, LONG_SIDE))
-    lights = tuple(replace(light, power=scale * light.power) for light in calibration.lights)
-    return replace(calibration, lights=lights, ambient=scale * calibration.ambient)
+    scale = _power_scale(replace(calibration, lights=used), stack)
+    return replace(_with_power(calibration, scale), ambient=scale * calibration.ambient)
 
 
 def with_common_power(calibration: Calibration, stack: PhotoStack) -> Calibration:
@@ -76,8 +75,11 @@ def with_common_power(calibration: Calibration, stack: PhotoStack) -> Calibratio
     Raises:
         CalibrationError: no pixel sees the ground under any light.
     """
-    scale = _power_scale(calibration, stack)
-    return replace(calibration, lights=tuple(replace(light, power=scale * light.power) for light in calibration.lights))
+    return _with_power(calibration, _power_scale(calibration, stack))
+
+
+def _with_power(calibration: Calibration, times: float) -> Calibration:
+    return replace(calibration, lights=tuple(replace(light, power=times * light.power) for light in calibration.lights))
 
 
 def _power_scale(calibration: Calibration, stack: PhotoStack) -> float:
@@ -89,7 +91,7 @@ def _power_scale(calibration: Calibration, stack: PhotoStack) -> float:
     Raises:
         CalibrationError: no pixel sees the ground under any light.
     """
-    ground, facing = albedo_by_photo(stack, calibration)
+    ground, facing = albedo_by_photo(reduced(stack, LONG_SIDE), calibration)
     if not ground.size:
         raise CalibrationError(
             f"no pixel shows the ground (z = {calibration.ground_height:g}) under any light; some were needed. Check "
