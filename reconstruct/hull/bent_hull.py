@@ -23,7 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from reconstruct.config import FitConfig
-from reconstruct.hull.follow_normals import Integrate, SomePixels, follow_normals, normals_bias, some_pixels
+from reconstruct.hull.follow_normals import Integrate, SomePixels, follow_normals, some_pixels
 from reconstruct.hull.hull_matter import hull_occupancy
 from reconstruct.hull.hull_parts import without_specks
 from reconstruct.hull.normal_integration import LIKELY, integrate_behind, integrate_normals, integrate_within, likeness
@@ -139,7 +139,7 @@ class BentHull:
         """Return what bends the present surface to the integral of the labels' normals."""
 
         def bend(now: SdfGrid, seen: Seen, labels: Labels) -> SdfGrid:
-            return follow_normals(now, self.scene, *seen, labels, integrate, normals_bias(self.scene))
+            return follow_normals(now, self.scene, *seen, labels, integrate)
 
         return bend
 
@@ -197,7 +197,7 @@ class _Within:
 
     def __call__(self, now: SdfGrid, seen: Seen, labels: Labels) -> SdfGrid:
         integrate = partial(self._integrate, labels)
-        return follow_normals(self._hull, self._scene, *self._seen, labels, integrate, normals_bias(self._scene))
+        return follow_normals(self._hull, self._scene, *self._seen, labels, integrate)
 
     def _integrate(
         self,

@@ -16,8 +16,6 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface
 
 FEWEST_PIXELS = 9
-BIAS = np.radians(1.5)  # of normals: common error of a whole side by highlights and interreflection
-LIT_BIAS = np.radians(4.0)  # the same of normals that are read from which lights reach a pixel
 SEEN = 0.3  # of the pixels about a node's must show the object for it to move
 ABOUT = 4.0  # voxels before and behind the surface in which nodes move
 MOST_OF_DEPTH = 0.8  # of the matter along a ray may be taken from its front
@@ -32,7 +30,6 @@ def follow_normals(
     own: Float[Tensor, "height width 3"],
     labels: Labels,
     integrate: Integrate,
-    bias: float = BIAS,
 ) -> SdfGrid:
     """Move the grid's visible side to the integral of the labels' normals.
 
@@ -41,7 +38,6 @@ def follow_normals(
         own: world, the surface's normals there; 0 on the ground.
         integrate: what is known of the surface so far: `integrate_normals`, or that it is a shadow hull, which the
             object is never in front of.
-        bias: rad, of the labels' normals: their integral does not move what it explains.
 
     Returns:
         The grid. Where it was moved, only its sign is right: it is no longer a distance.
@@ -52,18 +48,12 @@ def follow_normals(
     before, rays, seen = some.before, some.rays, np.isfinite(some.before)
     given = (rays, before, some.own, some.normals, some.trust)
     after = integrate(*given)
-    after = before + _beyond_bias(after - before, before, rays, bias)
     part = (slice(None, None, some.step), slice(None, None, some.step))
     shown = torch.from_numpy(seen)
     to_ground = (ground_points(scene) - points).norm(dim=-1)[part][shown]
     matter = _matter_behind(grid, points[part][shown], scene.directions[part][shown], to_ground)
     after[seen] = np.minimum(after[seen], before[seen] + MOST_OF_DEPTH * matter)
     return _with_front(grid, scene, before, after, some.step)
-
-
-def normals_bias(scene: Scene) -> float:
-    """Return the common error of a side's normals, rad: from shading, or from which lights reach a pixel."""
-    return BIAS if scene.rgb is not None else LIT_BIAS
 
 
 @dataclass(frozen=True)
@@ -94,19 +84,6 @@ def some_pixels(
     return SomePixels(
         step, scene.directions[part].numpy(), np.where(seen, t, np.nan), own[part].numpy(), normals, trust
     )
-
-
-def _beyond_bias(
-    move: Float[np.ndarray, "height width"],
-    before: Float[np.ndarray, "height width"],
-    rays: Float[np.ndarray, "height width 3"],
-    bias: float,
-) -> Float[np.ndarray, "height width"]:
-    """Subtract from a move the part that a common error bias of all normals makes between the outline and a pixel."""
-    pixel = np.linalg.norm(np.diff(rays, axis=1), axis=-1)
-    within = cv2.distanceTransform(np.isfinite(before).astype(np.uint8), cv2.DIST_L2, 5)
-    doubt = np.tan(bias) * within * float(np.median(pixel)) * before
-    return np.sign(move) * np.maximum(np.abs(move) - doubt, 0)
 
 
 def _matter_behind(
