@@ -46,8 +46,7 @@ def follow_normals(
     if some is None:
         return grid
     before, rays, seen = some.before, some.rays, np.isfinite(some.before)
-    given = (rays, before, some.own, some.normals, some.trust)
-    after = integrate(*given)
+    after = integrate(rays, before, some.own, some.normals, some.trust).copy()  # it may be the caller's state
     part = (slice(None, None, some.step), slice(None, None, some.step))
     shown = torch.from_numpy(seen)
     to_ground = (ground_points(scene) - points).norm(dim=-1)[part][shown]
