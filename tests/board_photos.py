@@ -67,13 +67,13 @@ def board_photo(board: Board, camera: Camera, world_from_camera: Pose, noise=3.0
     at = (0.5 / DOTS_PER_MM) - MARGIN_MM + first  # mm of the first dot's centre
     board_from_dots = np.array([[1 / DOTS_PER_MM, 0, at], [0, 1 / DOTS_PER_MM, at], [0, 0, 1]])
     photo_from_dots = camera.matrix() @ pose[:3, [0, 1, 3]] @ board_from_dots
-    # Drawn at twice the size and averaged, so that edges fall between pixels as they do on a sensor.
-    twice = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1.0]])
+    # Drawn at four times the size and averaged, so that edges fall between pixels as they do on a sensor.
+    finer = np.array([[4, 0, 1.5], [0, 4, 1.5], [0, 0, 1.0]])
     large = cv2.warpPerspective(
-        art, twice @ photo_from_dots, (2 * camera.width, 2 * camera.height), flags=cv2.INTER_AREA, borderValue=90
+        art, finer @ photo_from_dots, (4 * camera.width, 4 * camera.height), flags=cv2.INTER_AREA, borderValue=90
     )
     small = cv2.resize(
-        cv2.GaussianBlur(large, (0, 0), 1.5), (camera.width, camera.height), interpolation=cv2.INTER_AREA
+        cv2.GaussianBlur(large, (0, 0), 3.0), (camera.width, camera.height), interpolation=cv2.INTER_AREA
     )
     seen = 20 + 0.8 * small + np.random.default_rng(0).normal(0, noise, small.shape)
     return np.clip(seen, 0, 255).astype(np.uint8)

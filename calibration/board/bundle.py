@@ -14,7 +14,7 @@ from calibration.board.sheet import FLAT, FLATTEST, Sheet, Waves, nearest_corner
 from calibration.camera import project_from
 from capture.checks.robust import cauchy
 
-FINEST_NOISE = 0.04  # px: the corners of good photos are this good; few residuals may look better by chance
+FINEST_NOISE = 0.02  # px: corners of rendered photos are this good; few residuals may look better by chance
 N_PINHOLE = 4  # log fx, log fy/fx, cx, cy; the numbers of the distortion follow
 CENTRE_TAIL = 2.0  # sigmas from which the prior of the centre gives way: some sensors sit far off
 ROUNDS = 8  # of reweighting; noise level and weights settle in 3 to 5

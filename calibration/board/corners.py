@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from calibration.board.board import AnyBoard, Blank, Board, opencv_dictionary
+from calibration.board.corner_fit import fitted_corners
 from calibration.board.lattice import find_lattices, flat_view
 from calibration.board.placement import place, placed_markers
 from calibration.board.sheet_edges import find_edges
@@ -24,14 +25,8 @@ SEARCH_SIZES = (1000, 500, 2000)  # px, longer side: most boards; blurred ones; 
 MARKER_SIZE = 1500  # px, longer side: markers are read there, and in the whole photo
 ENOUGH_OF_BOARD = 0.6  # of its corners: no further size is tried, and no marker read
 MOSTLY_GOOD = 0.75  # of a lattice's corners fit the others; a lattice over clutter has half
-SADDLE_SMALLEST = 3.0  # px, half window of the saddle fit
-SADDLE_WIDEST = 0.2  # of the spacing, half window: well clear of the neighbours
-TO_THE_MARKER = 0.8  # of the way, half window
-BLUR_SHARE, BLUR_SMALLEST = 0.025, 1.0  # sigma of the blur before it: of the spacing, and px
-SADDLE_SAMPLES = 21  # along the window: two and a half in one sigma of the blur, so nothing falls between them
-WEIGHT_WIDTH = 1 / 1.5  # sigma of the weights in half windows: what lies at its edge hardly counts
-NEWTON_STEPS = 5  # to the saddle point; the last moves it by less than 0.001 px
-FARTHEST_SADDLE = 0.5  # half windows between the corner and its saddle point: beyond, it belongs to something else
+TO_THE_MARKER = 0.8  # of the way from an edge of a square to its marker: blur brings that nearer
+WIDEST_ARM = 0.2  # of a square: what is farther from an edge says nothing of it
 SMOOTH_FROM = {3: 20, 2: 12}  # fewest corners for a cubic, a quadratic to separate lens distortion from wrong corners
 STRAY = {3: 0.06, 2: 0.08, 0: 0.25}  # of the spacing: how far a corner may be off that, and off no model of distortion
 SMOOTH_ROUNDS = 10  # of reweighting
@@ -99,10 +94,8 @@ def _by_lattice(grey: Grey, board: Board, allow_part: bool, enough: float) -> Co
             break
     if best is None:
         return None
-    view = _flat_view(best.pixels, best.points[:, :2], board.square_mm)
-    # Around a corner it is plain to the marker, or half way to the next corner.
-    share = min(SADDLE_WIDEST, TO_THE_MARKER * (1 - board.marker_mm / board.square_mm) / 2)
-    return best if view is None else replace(best, pixels=_saddles(grey, best.pixels, view[1], share))
+    arm = min(WIDEST_ARM, TO_THE_MARKER * (1 - board.marker_mm / board.square_mm) / 2)
+    return replace(best, pixels=fitted_corners(grey, best.pixels, best.points[:, :2] / board.square_mm, arm))
 
 
 def grey_of(photo: Photo) -> Grey:
@@ -171,45 +164,6 @@ def read_markers(grey: Grey, dictionary: str) -> Markers:
             corners += np.sqrt(0.5) * outward / np.linalg.norm(outward, axis=1, keepdims=True)  # half a pixel inside
             read[number] = (corners + 0.5) / scale - 0.5
     return np.array(list(read), int), np.array(list(read.values())).reshape(-1, 4, 2)
-
-
-# --- saddle points ---------------------------------------------------------------------------------------------------
-
-
-def _saddles(
-    grey: Grey, pixels: Float[np.ndarray, "n 2"], spacing: Float[np.ndarray, " n"], share: float
-) -> Float[np.ndarray, "n 2"]:
-    """Move each corner to the nearby saddle point of brightness; corners without one stay unchanged.
-
-    The standard saddle-point fit: a quadratic through the slightly blurred brightness by least squares with Gaussian
-    weights, then a Newton step to zero gradient; the window moves along. Brightness stays as the file encodes it,
-    because a corner looks the same after half a turn under any tone curve.
-    """
-    reach = np.maximum(share * spacing, SADDLE_SMALLEST)
-    blur = max(BLUR_SHARE * float(np.median(spacing)), BLUR_SMALLEST)
-    margin = 2 * reach.max() + 4 * blur
-    corner = np.maximum(np.floor(pixels.min(0) - margin), 0).astype(int)
-    end = np.ceil(pixels.max(0) + margin).astype(int)
-    part = grey[corner[1] : end[1] + 1, corner[0] : end[0] + 1].astype(np.float32)
-    window = np.asarray(cv2.GaussianBlur(part, (0, 0), blur))
-    steps = np.linspace(-1, 1, SADDLE_SAMPLES)
-    x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
-    weight = np.exp(-(x**2 + y**2) / (2 * WEIGHT_WIDTH**2))
-    terms = np.stack([x**2, x * y, y**2, x, y, np.ones_like(x)], 1)
-    inverse = np.linalg.pinv(terms * weight[:, None]) * weight  # from the samples in the window to the six terms
-    at, is_saddle = pixels - corner, np.ones(len(pixels), bool)
-    for _ in range(NEWTON_STEPS):
-        u, v = ((at[:, k, None] + reach[:, None] * axis).astype(np.float32) for k, axis in enumerate((x, y)))
-        values = cv2.remap(window, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        xx, xy, yy, by_x, by_y, _ = inverse @ np.asarray(values, np.float64).T
-        determinant = 4 * xx * yy - xy**2
-        is_saddle &= determinant < 0
-        step = np.stack([xy * by_y - 2 * yy * by_x, xy * by_x - 2 * xx * by_y], 1)
-        step /= np.where(is_saddle, determinant, 1.0)[:, None]
-        is_saddle &= np.abs(step).max(1) < 1  # beyond, the quadratic is not valid
-        at = at + np.where(is_saddle[:, None], step * reach[:, None], 0.0)
-    is_saddle &= np.linalg.norm(at + corner - pixels, axis=1) < reach * FARTHEST_SADDLE
-    return np.where(is_saddle[:, None], at + corner, pixels)
 
 
 # --- common ----------------------------------------------------------------------------------------------------------
