@@ -61,7 +61,7 @@ def exr_size(path: Path) -> tuple[int, int]:
 
 
 def read_exr(path: Path) -> dict[str, Float[np.ndarray, "height width"]]:
-    """Return the channels of the first part, by name, float32, read-only.
+    """Return the channels of the first part, by name, float32.
 
     Raises:
         CaptureError: no readable OpenEXR file, or larger than PIXEL_CAP.
