@@ -17,7 +17,7 @@ from capture.files.names import is_clip_name, natural_order, refuse_no_folder, s
 from capture.files.regular import why
 from capture.files.schema import Number, Positive, Text, Vector, as_type
 from capture.photos.finding import Finding, grouped
-from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
+from capture.session.clip import choose_board_frames, choose_frames
 from capture.session.declared_objects import (
     MOST_LIGHTS,
     Cube,
@@ -110,8 +110,8 @@ class Session:
 def load_session(folder: Path, common: SessionSettings | None = None, seen: SeenPhotos | None = None) -> Session:
     """Read the session in a folder: `board/ photos/ [light/] [dark/] [side/]`, or all photos in one flat folder.
 
-    Photos are in the natural order of their names (IMG_9 before IMG_10). A clip may replace the photos, those of the
-    board and those without light; its chosen frames are photos with names such as clip#t=12.340s.mov.
+    Photos are in the natural order of their names (IMG_9 before IMG_10). A clip may replace the photos and those
+    of the board; its chosen frames are photos with names such as clip#t=12.340s.mov.
 
     Args:
         common: the settings of a capture of several views, for what the folder's own session.toml does not say. The
@@ -255,8 +255,8 @@ def _roles(
         stills = replace(sound, by_role=sound.by_role | {"": []})
         roles, notes = sorted_roles(stills, seen)[0], ()
         for clip in clips:
-            frames = choose_frames(clip, settings.clip_frames)
-            roles, notes = _with_frames(roles, frames.by_role(), settings), (*notes, frames.note)
+            frames, note = choose_frames(clip, settings.clip_frames)
+            roles, notes = _with_frames(roles, frames, settings), (*notes, note)
         roles = replace(roles, board=(*roles.board, *loose))
     if is_sorted(folder):
         roles, notes = _with_clips(roles, folder, settings)
@@ -275,15 +275,16 @@ def _with_clips(roles: Roles, folder: Path, settings: SessionSettings) -> tuple[
         )
     unread = [clip for role in beside if role not in clips for clip in beside[role]]
     notes = tuple(f"{clip.parent.name}/{clip.name} was left out: there are photos beside it" for clip in unread)
-    notes += tuple(f"side/{clip.name} was left out: photos are needed there, no clip" for clip in clips.get("side", ()))
+    notes += tuple(
+        f"{role}/{clip.name} was left out: photos are needed there, no clip"
+        for role in ("side", "dark")
+        for clip in clips.get(role, ())
+    )
     for clip in clips.get("lit", ()):
-        frames = choose_frames(clip, settings.clip_frames)
-        filmed = frames.by_role() | ({"dark": ()} if clips.get("dark") else {})
-        roles, notes = _with_frames(roles, filmed, settings), (*notes, frames.note)
+        frames, note = choose_frames(clip, settings.clip_frames)
+        roles, notes = _with_frames(roles, frames, settings), (*notes, note)
     for clip in clips.get("board", ()):
         roles = replace(roles, board=(*roles.board, *choose_board_frames(clip)))
-    for clip in clips.get("dark", ()):
-        roles = replace(roles, dark=(*roles.dark, *choose_any_frames(clip)))
     return roles, notes
 
 
