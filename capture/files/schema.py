@@ -122,13 +122,9 @@ def read_text(path: Path) -> str:
         CalibrationError: the file cannot be read, or is larger than LARGEST_FILE.
     """
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise CalibrationError(
-                f"{path} is larger than {LARGEST_FILE >> 20} MB; a description of a scene is smaller."
-            )
-        return path.read_text("utf-8-sig", errors="replace")
+        return read_regular(Path(os.path.realpath(path)), LARGEST_FILE).decode("utf-8-sig", errors="replace")
     except OSError as error:
-        raise CalibrationError(f"{path} cannot be read ({error.strerror}). Check the file and its name.") from error
+        raise CalibrationError(f"{path} cannot be read ({why(error)}). Check the file and its name.") from error
 
 
 def read_json(path: Path) -> Any:

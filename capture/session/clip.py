@@ -102,7 +102,7 @@ def choose_frames(clip: Path, count: int) -> tuple[dict[str, tuple[Path, ...]], 
 
 
 def choose_board_frames(clip: Path) -> tuple[Path, ...]:
-    """Choose sharp frames of a clip of the board whose pictures differ most, in their order.
+    """Choose sharp frames of a clip of the board, or without light, whose pictures differ most, in their order.
 
     Raises:
         CaptureError: the clip cannot be read.

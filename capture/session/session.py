@@ -110,8 +110,8 @@ class Session:
 def load_session(folder: Path, common: SessionSettings | None = None, seen: SeenPhotos | None = None) -> Session:
     """Read the session in a folder: `board/ photos/ [light/] [dark/] [side/]`, or all photos in one flat folder.
 
-    Photos are in the natural order of their names (IMG_9 before IMG_10). A clip may replace the photos and those
-    of the board; its chosen frames are photos with names such as clip#t=12.340s.mov.
+    Photos are in the natural order of their names (IMG_9 before IMG_10). A clip may replace the photos, those of the
+    board and those without light; its chosen frames are photos with names such as clip#t=12.340s.mov.
 
     Args:
         common: the settings of a capture of several views, for what the folder's own session.toml does not say. The
@@ -275,16 +275,14 @@ def _with_clips(roles: Roles, folder: Path, settings: SessionSettings) -> tuple[
         )
     unread = [clip for role in beside if role not in clips for clip in beside[role]]
     notes = tuple(f"{clip.parent.name}/{clip.name} was left out: there are photos beside it" for clip in unread)
-    notes += tuple(
-        f"{role}/{clip.name} was left out: photos are needed there, no clip"
-        for role in ("side", "dark")
-        for clip in clips.get(role, ())
-    )
+    notes += tuple(f"side/{clip.name} was left out: photos are needed there, no clip" for clip in clips.get("side", ()))
     for clip in clips.get("lit", ()):
         frames, note = choose_frames(clip, settings.clip_frames)
         roles, notes = _with_frames(roles, frames, settings), (*notes, note)
     for clip in clips.get("board", ()):
         roles = replace(roles, board=(*roles.board, *choose_board_frames(clip)))
+    for clip in clips.get("dark", ()):
+        roles = replace(roles, dark=(*roles.dark, *choose_board_frames(clip)))
     return roles, notes
 
 
