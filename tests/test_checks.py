@@ -225,11 +225,6 @@ def test_a_tripod_pushed_after_the_board_is_told_of_each_photo_and_leaves_none_o
     assert found[-1].value == pytest.approx(5, abs=0.3) and "off that of board/IMG_0.jpg" in found[-1].text
 
 
-def test_photos_of_a_step_are_told_together_though_each_alone_is_not_sure(stack):
-    found = check_stack(pushed_from(stack, 7, 0.35, 0.2))
-    assert names(found) == [(f"IMG_{k}.jpg", "camera moved", True) for k in range(7, N)]
-
-
 # --- shake without texture -------------------------------------------------------------------------------------------
 
 

@@ -11,7 +11,7 @@ from lit_table import save_photo
 import capture.session.clip
 from capture.errors import CaptureError
 from capture.files.names import clip_of
-from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
+from capture.session.clip import choose_board_frames, choose_frames
 from capture.session.session import load_session
 from reconstruct.run.pipeline import claim, write_thumbnails
 from reconstruct.run_folder.folder import RunFolder
@@ -29,7 +29,7 @@ def filmed(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def chosen(filmed):
-    return choose_frames(filmed, N)
+    return choose_frames(filmed, N)[0]
 
 
 def times_of(paths):
@@ -37,21 +37,20 @@ def times_of(paths):
 
 
 def test_sharp_moments_under_the_flashlight_from_all_around_are_chosen_and_board_and_dark_before_and_after(chosen):
-    times = times_of(chosen.lit)
+    times = times_of(chosen["lit"])
     assert len(times) == N and (np.diff(times) > 0).all()
     assert times[0] >= ROOM_S + ARM_S and times[-1] <= ROOM_S + ARM_S + LIT_S
     angle = clips.light_angle(times) % (2 * np.pi)
     gaps = np.diff(np.sort(np.append(angle, angle.min() + 2 * np.pi)))
     assert np.degrees(gaps).max() < 45 and np.degrees(gaps).min() > 4  # evenly would be 18 degrees
     assert not any(clips.is_blurred(time_s) for time_s in times)
-    assert len(chosen.board) == 1 and times_of(chosen.board)[0] < ROOM_S
-    assert len(chosen.dark) >= 3 and times_of(chosen.dark).min() >= ROOM_S + ARM_S + LIT_S
-    assert "20 frames" in chosen.note and "room light" in chosen.note
+    assert len(chosen["board"]) == 1 and times_of(chosen["board"])[0] < ROOM_S
+    assert len(chosen["dark"]) >= 3 and times_of(chosen["dark"]).min() >= ROOM_S + ARM_S + LIT_S
 
 
 def test_memory_is_bounded_for_long_clips(filmed, monkeypatch):
     monkeypatch.setattr(capture.session.clip, "MOST_CANDIDATES", 10)
-    assert len(choose_frames(filmed, N).lit) <= 10
+    assert len(choose_frames(filmed, N)[0]["lit"]) <= 10
 
 
 def test_a_clip_in_even_light_is_refused(tmp_path):
@@ -64,7 +63,6 @@ def test_a_clip_in_even_light_is_refused(tmp_path):
     with pytest.raises(CaptureError, match=r"a\.mp4 shows a moving flashlight in 0 of \d+ examined frames"):
         choose_frames(tmp_path / "a.mp4", N)
     assert len(choose_board_frames(tmp_path / "a.mp4")) == 1  # nothing moves: one view
-    assert len(choose_any_frames(tmp_path / "a.mp4")) == 5
 
 
 # --- as a session ----------------------------------------------------------------------------------------------------

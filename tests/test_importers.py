@@ -21,7 +21,6 @@ from dataset_folders import (
 from PIL import Image
 from synthetic import BALL, HEAP, Look, Sphere, render
 
-import calibration.scenes
 import shadowgraph
 from calibration.calibration import save_calibration
 from calibration.scenes.distant_camera import picture_camera
@@ -313,22 +312,6 @@ def test_the_focal_length_of_exif_is_the_cameras_unless_the_picture_was_cropped(
     assert whole.camera.fx == pytest.approx(70 / 43.27 * np.hypot(150, 100)) and "EXIF" in said
     cropped, said = picture_camera([tmp_path / "cropped.jpg"])
     assert cropped.camera.fx == 1000 and "assumed" in said
-
-
-def test_a_layout_of_another_program_is_one_module(tmp_path, monkeypatch):
-    name = "lamps_of_a_dome"
-    (tmp_path / "modules").mkdir()
-    (tmp_path / "modules" / f"layout_of_{name}.py").write_text(
-        "from calibration.known_scene import Importer\n"
-        f"find = lambda folder: '{name}.xyz' if (folder / '{name}.xyz').exists() else None\n"
-        f"IMPORTER = Importer('a layout of {name}', find, lambda folder, split: None)\n"
-    )
-    monkeypatch.setattr(calibration.scenes, "__path__", [*calibration.scenes.__path__, str(tmp_path / "modules")])
-    with pytest.raises(CaptureError, match=f"none of the layouts .*a layout of {name}"):
-        import_folder(tmp_path, "train", tmp_path / "ours")
-    (tmp_path / f"{name}.xyz").touch()
-    found = find_importer(tmp_path)
-    assert found is not None and found.layout == f"a layout of {name}"
 
 
 # --- lights from another file, and a mask of one's own ---------------------------------------------------------------

@@ -161,7 +161,7 @@ def test_a_list_with_sigmas_is_weighed_against_what_the_photos_say(tmp_path):
         ("a.json", '{"lights": [{"photo": "IMG_0000.jpg", "position": [1, 2]}]}', r"lights\[0\].position is \[1, 2\]"),
         ("a.json", '{"lights": [{"photo": "IMG_0000.jpg", "position": [1, 2, 3]}]}', "no light for 3 of 4 photos"),
         ("a.json", '{"suns": []}', "of no known kind"),
-        ("a.json", "{", "is not JSON"),
+        ("a.json", "{", "cannot be read as JSON"),
         ("a.npz", "no archive", "cannot be read"),
         ("a.dome", '{"positions3d": [[0, 0, 1]], "directions": []}', "'imageWidth'"),
         ("params.json", json.dumps({"light_pos": [], "pose_c2w": np.eye(4).tolist()}), "one place for each photo"),

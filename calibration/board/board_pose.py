@@ -18,7 +18,6 @@ ROBUST_AT = 3 * CORNER_SIGMA  # px: a corner this far off begins to count less (
 CLEAR_WIN = 16.0  # difference of chi-square between the two poses: odds of exp(8), 3000 to 1
 SAME_NORMAL = np.radians(1.0)  # two poses whose ground differs by less count as one
 WORST_NORMAL = np.radians(2.0)  # one sigma: beyond, heights over the ground are off by 3 % of the way across
-ROUNDING = 1e-6  # of the focal length, 0.001 to 0.004 px: far below the error of a corner, far above rounding
 FOCUS_SIGMA = 0.015  # of log f: focus breathing of phones' main cameras
 SAME_LENS = 0.05  # of log f in EXIF: beyond, another lens or zoom
 WORST_MISFIT = 0.002  # of the photo's longer side: 8 px at 4000 is a wrong board or a bent one
@@ -173,22 +172,13 @@ def plane_poses(
 
     Heights of the points are left out (Collins and Bartoli 2014 know planes only).
     """
-    poses, errors = _ippe(points, flat)
-    if not np.isfinite(poses).all():  # IPPE divides by 0 where a board without any noise faces the camera
-        poses, errors = _ippe(points, flat + ROUNDING * np.sin(np.arange(flat.size)).reshape(flat.shape))
-    order = np.argsort(errors)
-    return poses[order], errors[order]
-
-
-def _ippe(
-    points: Float[np.ndarray, "n 3"], flat: Float[np.ndarray, "n 2"]
-) -> tuple[Float[np.ndarray, "poses 6"], Float[np.ndarray, " poses"]]:
     found, rotations, translations, errors = cv2.solvePnPGeneric(
         points * [1.0, 1.0, 0.0], np.ascontiguousarray(flat)[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
     )
     pairs = zip(rotations, translations, strict=True) if found else ()
     poses = np.array([np.concatenate([np.ravel(r), np.ravel(t)]) for r, t in pairs]).reshape(-1, 6)
-    return poses, np.ravel(errors)[: len(poses)]
+    order = np.argsort(np.ravel(errors)[: len(poses)])
+    return poses[order], np.ravel(errors)[order]
 
 
 def fit_pose(start: Float[np.ndarray, " numbers"], corners: Corners, camera: Camera, robust_at: float) -> BoardView:

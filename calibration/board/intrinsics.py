@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from calibration.board.board import AnyBoard, Blank
-from calibration.board.board_pose import CORNER_SIGMA, PoseSpread, fit_pose, reprojected
+from calibration.board.board_pose import PoseSpread
 from calibration.board.bundle import Lens, Prior, Solution, opencv_lens, solve
 from calibration.board.corners import Corners
 from calibration.camera import Camera
@@ -29,9 +29,8 @@ FISHEYE_SIGMA = 0.1  # of k1 to k4 of the angle: an equidistant lens has 0
 PAPER_MM = 0.15  # of a printed sheet: the table lies that much below the print
 WORTH_SAYING_MM = 0.3  # waves of the sheet; less is usual and does no harm
 LENS_DOUBT_PX = 0.08  # rms at 1000 px: below, which is the noise of good corners, nothing is left to explain
-FEWEST_TO_CHOOSE = 4  # photos, so that each can be held out of a fit to several others
-FOLDS = 4
-CLEARLY_BETTER = 0.8  # times the held-out error of the simpler lens; .9 comes by chance in a quarter of captures
+FEWEST_TO_CHOOSE = 4  # photos
+CLEARLY_BETTER = 0.8  # times what the simpler lens leaves: a few numbers more explain less by chance
 
 
 @dataclass(frozen=True)
@@ -170,44 +169,19 @@ def _with_exif(
 
 
 def _chosen_lens(plain: Solution, photos: Sequence[Corners], size: tuple[int, int], notes: list[str]) -> Lens:
-    """Return the simplest lens whose error on held-out corners is about as small as any."""
+    """Return the simplest lens that leaves about as little of the corners as any."""
     doubt = LENS_DOUBT_PX * max(size) / 1000
     if len(photos) < FEWEST_TO_CHOOSE or np.median(plain.rms) < doubt:
         return plain.lens
-    best, least = plain.lens, _held_out_error(plain.lens, plain, photos, size)
+    best, least = plain.lens, float(np.median(plain.rms))
     for each in (TILTED, FISHEYE):
         lens = replace(each, stretch=plain.lens.stretch)
-        error = _held_out_error(lens, plain, photos, size)
+        error = float(np.median(solve(photos, _prior(size, None, UNKNOWN_SIGMA, lens), plain).rms))
         if error < CLEARLY_BETTER * least:
             best, least = lens, error
     if best is not plain.lens:
-        notes.append(
-            f"The lens is described by {best.name}: that fits corners best that it was not made from ({least:.2f} px)."
-        )
+        notes.append(f"The lens is described by {best.name}: that fits the corners best ({least:.2f} px).")
     return best
-
-
-def _held_out_error(lens: Lens, plain: Solution, photos: Sequence[Corners], size: tuple[int, int]) -> float:
-    """Return the median distance, px, of every second corner in photos that the lens was not fitted to.
-
-    The poses of these photos come from the other half of their corners.
-    """
-    distances = []
-    prior = _prior(size, None, UNKNOWN_SIGMA, lens)
-    poses = plain.poses()
-    for fold in range(FOLDS):
-        out = np.arange(len(photos)) % FOLDS == fold
-        if not out.any():
-            continue
-        kept = [photo for photo, is_out in zip(photos, out, strict=True) if not is_out]
-        solution = solve(kept, prior, plain.without(~out))
-        camera = _camera(solution, size)
-        for index in np.nonzero(out)[0]:
-            sheet = solution.on_sheet(photos[index])
-            fitting, testing = (sheet.part(slice(parity, None, 2)) for parity in (0, 1))
-            view = fit_pose(poses[index], fitting, camera, CORNER_SIGMA)
-            distances.append(np.linalg.norm(reprojected(view.numbers, testing, camera)[0], axis=1))
-    return float(np.median(np.concatenate(distances)))
 
 
 def _prior(size: tuple[int, int], focal_35mm: float | None, focal_sigma: float, lens: Lens = PLAIN) -> Prior:

@@ -1,7 +1,6 @@
 """Recognise the board in the photos without a description, from marker numbers or from the grid of corners."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,8 +23,6 @@ FAMILIES = (  # by increasing size: the small ones are the beginnings of the lar
     ("DICT_APRILTAG_36h11",),
 )
 MOST_COLUMNS = 20  # squares
-MOST_HIDDEN_ROWS = 2  # after the last marker that was read; their corners show them
-ROW_SEEN = 0.5  # of a row's corners make a row
 AGREEING = 0.7  # of the markers; the rest may be false detections
 SURE_MARKERS = 10  # that lie on one board: no other dictionary reads so many by chance, so none is asked
 FEWEST_CORNERS = 20  # inner corners, as of 5 x 4: smaller grids are found in tablecloths
@@ -77,7 +74,8 @@ def _guess_charuco(photos: Sequence[Grey]) -> Board | None:
         layouts = [found for found in (_layout(*markers) for markers in seen) if found is not None]
         for columns, ratio, _, _ in sorted(layouts, key=lambda one: -one.n_markers)[:2]:
             top = max(one.top for one in layouts if one.columns == columns)
-            board, n_corners = _with_hidden_rows(_charuco(columns, top, ratio, family), small)
+            board = _charuco(columns, top, ratio, family)
+            n_corners = _n_corners(board, small)
             if n_corners and (best is None or n_corners > best[0]):
                 best = n_corners, board
         if best and max((one.n_markers for one in layouts), default=0) >= SURE_MARKERS:
@@ -134,25 +132,10 @@ def _charuco(columns: int, top: int, ratio: float, family: tuple[str, ...]) -> B
     return Board("charuco", columns, rows, ASSUMED_SQUARE_MM, round(ratio * ASSUMED_SQUARE_MM, 1), dictionary)
 
 
-def _with_hidden_rows(board: Board, photos: Sequence[Grey]) -> tuple[Board, int]:
-    """Add rows whose corners are seen but whose markers were not read; return the board and its number of corners."""
-    n_corners = _n_corners(board, photos)
-    for _ in range(MOST_HIDDEN_ROWS):
-        longer = replace(board, rows=board.rows + 1)
-        if longer.columns * longer.rows // 2 > len(opencv_dictionary(board.dictionary).bytesList):
-            break
-        n_further = _n_corners(longer, photos, from_row=board.rows - 1 if n_corners else 0)
-        if n_corners and n_further < ROW_SEEN * (board.columns - 1):
-            break
-        board, n_corners = longer, n_corners + n_further
-    return board, n_corners
-
-
-def _n_corners(board: Board, photos: Sequence[Grey], from_row: int = 0) -> int:
-    """Count the seen corners from this row on, over all photos."""
-    highest = -(from_row + 0.75) * board.square_mm  # rows run towards negative y; markers lie half way between two
+def _n_corners(board: Board, photos: Sequence[Grey]) -> int:
+    """Count the corners of this board that are seen, over all photos."""
     found = [corners for photo in photos if (corners := find_board(photo, board)) is not None]
-    return sum(int((corners.points[:, 1] < highest).sum()) for corners in found if corners.board == board)
+    return sum(len(corners.points) for corners in found if corners.board == board)
 
 
 # --- checkerboard ----------------------------------------------------------------------------------------------------

@@ -1,13 +1,11 @@
 """Choose the importer for a folder: one of the layouts of other programs, or a capture of our own."""
 
-import importlib
-import pkgutil
 from dataclasses import replace
 from pathlib import Path
 
 from calibration.known_scene import Importer, KnownScene
-from calibration.scenes.listed_lights import listed_lights
-from calibration.scenes.own_scene import save_scene
+from calibration.scenes import deepshadow, diligent, own_scene, s3nerf, shadowneus
+from calibration.scenes.listed_lights import IMPORTER, RTI, listed_lights
 from capture.errors import CaptureError
 from capture.files.names import refuse_no_folder
 from capture.photos.finding import grouped
@@ -18,12 +16,10 @@ BOARD, SETTINGS = "board", "session.toml"
 OF_A_CAPTURE = (SETTINGS, BOARD)  # what a capture of ours has and no other layout; lists of lights may lie by it
 
 
-def importers() -> tuple[Importer, ...]:
-    """Return the importers of other programs' layouts: each that a module of this package has among its names."""
-    package = importlib.import_module(__name__.rpartition(".")[0])
-    modules = (importlib.import_module(f"{package.__name__}.{m.name}") for m in pkgutil.iter_modules(package.__path__))
-    found = [value for module in modules for value in vars(module).values() if isinstance(value, Importer)]
-    return tuple(dict.fromkeys(found))
+IMPORTERS = (
+    *(deepshadow.IMPORTER, diligent.IMPORTER, IMPORTER, RTI, own_scene.IMPORTER, s3nerf.IMPORTER),
+    *(shadowneus.IMPORTER, shadowneus.OF_PHOTOGRAPHS),
+)
 
 
 def find_importer(folder: Path, lights: Path | None = None) -> Importer | None:
@@ -45,7 +41,7 @@ def find_importer(folder: Path, lights: Path | None = None) -> Importer | None:
         if settings.board is not None or BOARD in settings.roles:
             return None
     named = _name_in(folder, lights)
-    others = () if is_a_capture else (one for one in importers() if not one.gives_way)
+    others = () if is_a_capture else (one for one in IMPORTERS if not one.gives_way)
     every = (*others, listed_lights(lights if lights is not None and lights.is_file() else None))
     found = [(importer, importer.recognises(folder)) for importer in every]
     reasons = [(i, why) for i, why in found if why and (i.gives_way or not (named and why.startswith(named)))]
@@ -76,7 +72,7 @@ def import_folder(folder: Path, split: str, out: Path) -> tuple[Importer, KnownS
     refuse_no_folder(folder, "the folder of a scene")
     importer = find_importer(folder)
     if importer is None:
-        layouts = ", ".join(one.layout for one in importers())
+        layouts = ", ".join(one.layout for one in IMPORTERS)
         raise CaptureError(
             f"{folder} has none of the layouts that can be imported ({layouts}). A capture of your own needs no "
             "import: `shadowgraph run` reads it."
@@ -84,5 +80,5 @@ def import_folder(folder: Path, split: str, out: Path) -> tuple[Importer, KnownS
     scene = importer.load(folder, split)
     if scene.photos.left_out:
         scene = replace(scene, notes=(*scene.notes, f"left out: {grouped(scene.photos.left_out)}"))
-    save_scene(scene, importer.layout, out)
+    own_scene.save_scene(scene, importer.layout, out)
     return importer, scene

@@ -20,12 +20,11 @@ from capture.checks.alignment import (
     HomeView,
     allowed_px,
     board_findings,
-    densest,
     home_view,
     in_cells,
 )
-from capture.checks.registration import is_lit, moved_back
-from capture.checks.robust import column_quantile, column_spread
+from capture.checks.registration import moved_back
+from capture.checks.robust import column_quantile, column_spread, spread
 from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
 
@@ -42,15 +41,8 @@ SMEARED = 0.76  # of the usual; shaken photos gave 0.58 to 0.75 (32 of 32), good
 MOVED_SIGMAS = 5.0  # of the shift, and of how much the photos' shifts differ
 AS_MOVED = 0.6  # slope of how cells differ, over what the shift makes of their texture: 0.68 and more, shading 0.53
 WAYS = 12  # in the picture, over half a turn, along each of which a shift is compared with its error
-FEWEST_ALIKE = 2  # photos moved to the same place, from which the tripod stayed there
-BLURRED = 0.8  # contrast of fixed texture; good photos gave 0.88 and more, 9 px of shake 0.75 and less
-HARMLESS_PX = 1.0  # of the stack: moving a photo back by so little costs no contrast; where that is low, it was shaken
-STILL_SHARP = 0.9  # median slope of cells, over the whole picture, from which no photo is blurred
+BLURRED = 0.8  # median slope of cells, over that of the other photos
 BLUR_SIGMAS = 6.0  # so far below the others as well: on rough or glossy ground light itself changes it
-CONTRAST_NOISE = 0.02  # one sigma of contrast at best
-STRONG = 99  # percentile of texture strength from which a pixel takes part in the contrast
-FEWEST_PIXELS = 200
-REPEATS = 0.7  # slope between the textures of the two halves; less is noise, and shows no shift
 MISSING = 0.3  # slope of a cell's texture over the common one, below which something hides it
 STEADY = 0.8  # share of the lit photos that must show a cell's texture: else light makes it
 COVERED = 0.01  # of the picture, in one piece; good photos gave 0.4 % on the faintest grain
@@ -107,18 +99,16 @@ def view_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack |
     home = home_view(stack, indices, board)
     view = home.alignment
     shown, steady = _cells(view, home.members)
-    low = _low_contrast(_contrasts(view))
     known = [one[steady & np.isfinite(one)] for one in shown]
-    seen = [float(np.median(one)) if len(one) else np.nan for one in known]  # usual slope; NaN: no cell of them is lit
+    seen = np.array([np.median(one) if len(one) else np.nan for one in known])  # NaN: no cell of them is lit
+    low = _lowest_contrast(seen)
     moved, limits = _moved_photos(home, [not slope < SAME_VIEW for slope in seen], steady)
     sharpness = edge_sharpness(view.brightness)
     found = []
     for k, i in enumerate(indices):
         path = stack.paths[i]
-        is_soft = k in low and not seen[k] > STILL_SHARP
-        if (is_soft and home.lengths[k] < HARMLESS_PX) or ((is_soft or seen[k] < SAME_VIEW) and k not in moved):
-            contrast = low.get(k, (seen[k], SAME_VIEW))
-            found.append(_blurred_or_another(path, *contrast, _own_strength(view, k)))
+        if seen[k] < low and k not in moved:
+            found.append(_blurred_or_another(path, seen[k], low, _own_strength(view, k)))
         elif k in moved:
             found.append(_moved(stack, path, float(home.lengths[k]), float(limits[k]), *home.fault(path)))
         elif (share := _hidden_share(view, k, shown[k], steady)) > COVERED:
@@ -140,26 +130,13 @@ def _moved_photos(
 ) -> tuple[set[int], Float[np.ndarray, " photos"]]:
     """Return the photos whose camera was displaced, and the shift from which each counts as moved, px of the stack.
 
-    These are photos of a group without the board and photos with a significant shift. A moved tripod stays at its new
-    place. Photos beside and after a moved one that lie nearer to the place of several moved ones than to their expected
-    place therefore count as moved, even if their own shift alone is not significant.
+    These are photos of a group without the board and photos with a significant shift.
     """
     far = np.flatnonzero(home.lengths > allowed_px(home.alignment.seen[0])).tolist()
     differing = {k for k in far if is_same[k] and _is_explained(home, k, steady)}
     limits = _motion_limits(home, differing)
     moved = {k for k in far if is_same[k] and (k in home.pushed or k in differing) and home.lengths[k] > limits[k]}
-    if len(moved) < FEWEST_ALIKE:
-        return moved, limits
-    shifts, radius = home.alignment.shifts, allowed_px(home.alignment.seen[0]) / 2
-    middle, near = densest(shifts[sorted(moved)], radius)
-    if near.sum() < FEWEST_ALIKE:
-        return moved, limits
-    first = sorted(moved)[int(np.argmax(near))]
-    apart = np.hypot(*(shifts - middle).T)
-    while first and apart[first - 1] < home.lengths[first - 1] / 2:
-        first -= 1
-    stayed = {k for k in range(first, len(shifts)) if is_same[k] and apart[k] < home.lengths[k]}
-    return moved | stayed, limits
+    return moved, limits
 
 
 def _motion_limits(home: HomeView, differing: set[int]) -> Float[np.ndarray, " photos"]:
@@ -218,53 +195,12 @@ def _blurred_or_another(path: Path, contrast: float, limit: float, own: float) -
     return Finding(path, "blurred", text, contrast, limit, True)
 
 
-def _low_contrast(contrasts: Float[np.ndarray, "photos axes"]) -> dict[int, tuple[float, float]]:
-    """Contrast and limit of photos far below the others, once these are out of what the others are like.
-
-    An axis weighs the more the less the photos differ in it.
-    """
-    axes = contrasts[:, np.isfinite(contrasts).any(0)]
-    known = np.flatnonzero(np.isfinite(axes).any(1))
-    found: dict[int, tuple[float, float]] = {}
-    while len(usual := np.setdiff1d(known, list(found))) >= FEWEST_PHOTOS:
-        relative = axes / np.nanmedian(axes[usual], 0)
-        trust = 1 / (_spread(relative[usual]) ** 2 + CONTRAST_NOISE**2)
-        weights = np.where(np.isfinite(relative), trust, 0)[known]
-        values = (np.nan_to_num(relative[known]) * weights).sum(1) / weights.sum(1)
-        others = values[np.isin(known, usual)]
-        limit = min(BLURRED, 1 - BLUR_SIGMAS * float(_spread(others[:, None])[0]))
-        low = {int(k): (float(value), limit) for k, value in zip(known, values, strict=True) if value < limit}
-        if low.keys() <= found.keys():
-            break
-        found |= low
-    return found
-
-
-def _spread(values: Float[np.ndarray, "photos columns"]) -> Float[np.ndarray, " columns"]:
-    """One sigma of each column, from the median absolute deviation."""
-    return column_spread(values - np.nanmedian(values, 0))
-
-
-def _contrasts(view: Alignment) -> Float[np.ndarray, "photos axes"]:
-    """Slope of each photo's texture over that of the other half, from one pixel to the next: down, and to the right.
-
-    Shake along one axis leaves the texture of the other. NaN where the halves do not agree on any texture, or where too
-    little of it is lit.
-    """
-    contrasts = np.full((len(view.textures), 2), np.nan)
-    for axis in (0, 1):
-        first, second = (np.diff(half, axis=axis) for half in view.halves)
-        strength = np.where(first * second > 0, np.minimum(np.abs(first), np.abs(second)), 0)
-        strong = strength >= max(float(np.percentile(strength, STRONG)), np.finfo(np.float32).tiny)
-        one_sided = np.abs(first) >= np.percentile(np.abs(first), STRONG)
-        if np.median(second[one_sided] / first[one_sided]) < REPEATS:
-            continue
-        for k, texture in enumerate(view.textures):
-            usable = np.diff(texture, axis=axis)
-            pixels = strong & is_lit(view.brightness[k][: usable.shape[0], : usable.shape[1]])
-            if pixels.sum() >= FEWEST_PIXELS:
-                contrasts[k, axis] = np.median(usable[pixels] / (first, second)[view.others[k]][pixels])
-    return contrasts
+def _lowest_contrast(seen: Float[np.ndarray, " photos"]) -> float:
+    """Return the median slope of cells below which a photo lies far below the others."""
+    if not np.isfinite(seen).any():
+        return SAME_VIEW
+    usual = float(np.nanmedian(seen))
+    return max(SAME_VIEW, min(BLURRED * usual, usual - BLUR_SIGMAS * spread(seen - usual)))
 
 
 def _cells(

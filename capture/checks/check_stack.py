@@ -21,15 +21,13 @@ from capture.checks.alignment import (
     FEWEST_PHOTOS,
     MOVED,
     REFERENCE_PX,
-    HomeView,
-    allowed_px,
     home_view,
     textures_of,
 )
 from capture.checks.ambient_light import shadow_findings
 from capture.checks.camera_motion import view_findings
 from capture.checks.framing import NOT_COMPARED, framing_findings
-from capture.checks.registration import Angles, Homography, Rotation, moved
+from capture.checks.registration import Homography, Rotation, moved
 from capture.decode.exif import focal_in_pixels
 from capture.photos.channels import largest_channel, mean_of_channels
 from capture.photos.finding import Finding
@@ -213,21 +211,10 @@ def _motions(
         if stack.paths[i] in off:
             pair, start = (view.seen[k], view.brightness[k]), rotation.from_shift(view.shifts[k])
             turns[i], _ = view.points.refined(*pair, view.others[k], start, rotation.homography)
-    own = {i: rotation.homography(one) for i, one in _shared(turns, rotation.focal, home).items()}
+    own = {i: rotation.homography(one) for i, one in turns.items() if np.isfinite(one).all()}
     own = {i: motion for i, motion in own.items() if _shift_of(motion, stack) <= farthest}
     if board is None or len(near) == len(off):
         return own, None
     pair = (planes[0] for planes in textures_of(board, [0]))
     angles, _ = view.points.refined(*pair, 0, rotation.from_shift(home.shift), rotation.homography)
     return own, rotation.homography(angles) if np.isfinite(angles).all() else None
-
-
-def _shared(turns: dict[int, Angles], focal: float, home: HomeView) -> dict[int, Angles]:
-    """Give photos whose rotations are alike their median one: after a tap the phone stays where it is.
-
-    One photo's light tells a shift along the grain of wood to some tenths of a pixel only.
-    """
-    known = {i: one for i, one in turns.items() if np.isfinite(one).all()}
-    near = allowed_px(home.alignment.seen[0]) / focal
-    alike = {i: [other for other in known.values() if np.linalg.norm(other - one) < near] for i, one in known.items()}
-    return {i: np.median(some, axis=0) for i, some in alike.items()}

@@ -232,13 +232,10 @@ def _counted(
 
 def _fitted(seen: Points, to: Points, is_similarity: bool) -> Float[np.ndarray, "3 3"] | None:
     """The motion by least squares."""
-    if not is_similarity:
-        return cv2.findHomography(seen, to, 0)[0] if len(seen) >= CORNERS else None
-    u, v = seen.T.astype(float)
-    zero, one = np.zeros_like(u), np.ones_like(u)
-    rows = np.concatenate([np.stack([u, -v, one, zero], -1), np.stack([v, u, zero, one], -1)])
-    a, b, x, y = np.linalg.lstsq(rows, to.T.astype(float).ravel(), rcond=None)[0]
-    return np.array([[a, -b, x], [b, a, y], [0.0, 0.0, 1.0]])
+    if is_similarity:
+        affine = cv2.estimateAffinePartial2D(seen, to, ransacReprojThreshold=np.inf)[0]
+        return None if affine is None else np.vstack([affine, [0, 0, 1]])
+    return cv2.findHomography(seen, to, 0)[0] if len(seen) >= CORNERS else None
 
 
 def _grid(width: int, height: int) -> Float[np.ndarray, "n 2"]:

@@ -50,18 +50,8 @@ def exr_header(path: Path) -> ExrHeader:
         return _header(path, answer())
 
 
-def exr_size(path: Path) -> tuple[int, int]:
-    """Return width and height (px) of the stored picture, without reading it.
-
-    Raises:
-        CaptureError: no readable OpenEXR file.
-    """
-    header = exr_header(path)
-    return header.width, header.height
-
-
 def read_exr(path: Path) -> dict[str, Float[np.ndarray, "height width"]]:
-    """Return the channels of the first part, by name, float32, read-only.
+    """Return the channels of the first part, by name, float32.
 
     Raises:
         CaptureError: no readable OpenEXR file, or larger than PIXEL_CAP.

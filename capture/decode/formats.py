@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 from PIL import Image
 
-from capture.decode.exr import colour_channels, exr_size, read_exr
+from capture.decode.exr import colour_channels, exr_header, read_exr
 from capture.decode.heif import read_heif, read_heif_header
 from capture.decode.limits import broken, check_size
 from capture.decode.pictures import opencv_channels, raw_size, read_raw, read_tiff
@@ -161,12 +161,10 @@ def read_size(path: Path) -> tuple[int, int]:
 
 def _stored_size(path: Path, kind: str) -> tuple[int, int]:
     try:
-        if kind == "exr":
-            return exr_size(path)
         if kind == "raw":
             return raw_size(path)
-        if kind in ("heif", "avif"):
-            header = read_heif_header(path)
+        if kind in ("exr", "heif", "avif"):
+            header = exr_header(path) if kind == "exr" else read_heif_header(path)
             return header.width, header.height
         if kind == "tiff":  # Pillow opens no float32 in colour
             return _tiff_size(path)

@@ -1,5 +1,6 @@
 """Strangers' files as types: a value becomes what a file must hold, or one sentence says what is wrong where."""
 
+import os
 import re
 import sys
 from collections.abc import Iterable
@@ -121,35 +122,27 @@ def read_text(path: Path) -> str:
         CalibrationError: the file cannot be read, or is larger than LARGEST_FILE.
     """
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise CalibrationError(
-                f"{path} is larger than {LARGEST_FILE >> 20} MB; a description of a scene is smaller."
-            )
-        return path.read_text("utf-8-sig", errors="replace")
+        return read_regular(Path(os.path.realpath(path)), LARGEST_FILE).decode("utf-8-sig", errors="replace")
     except OSError as error:
-        raise CalibrationError(f"{path} cannot be read ({error.strerror}). Check the file and its name.") from error
+        raise CalibrationError(f"{path} cannot be read ({why(error)}). Check the file and its name.") from error
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file of limited size and depth, of a capture or of another program's scene.
+    """Return a JSON file of a capture or of another program's scene as it stands.
 
     Raises:
-        CalibrationError: the file cannot be read, is larger than LARGEST_FILE, is not JSON, or is nested too deeply.
+        CalibrationError: as `read_as`.
     """
-    text = read_text(path)
-    try:
-        return parse_json(text)
-    except ValueError as error:  # no JSON, or digits and brackets without end
-        raise CalibrationError(f"{path} is not JSON ({why(error)}); export the scene again.") from error
+    return read_scene(path, Any)
 
 
 def read_scene(path: Path, kind: type[Kind]) -> Kind:
-    """Read a JSON file of a capture or of another program's scene as a type.
+    """Return a JSON file of a capture or of another program's scene as a type; links to it are followed.
 
     Raises:
-        CalibrationError: as read_json, or a value is of another type; names it.
+        CalibrationError: as `read_as`.
     """
-    return as_type(read_json(path), kind, str(path), EXPORT)
+    return read_as(Path(os.path.realpath(path)), kind, EXPORT)[0]
 
 
 def _fault(said: str, own: bool, place: str, value: Any, kind: Any) -> str:

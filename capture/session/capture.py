@@ -89,14 +89,7 @@ def load_capture(folder: Path, seen: SeenPhotos | None = None) -> Capture:
         )
     capture = _of_views(folder, views, settings, (), "", seen)
     anew = (_of_views(one, folders_named(one, VIEWS), settings, capture.board, one.name, seen) for one in object_poses)
-    capture = replace(capture, object_poses=tuple(anew))
-    count = len(capture.sessions())
-    if count > MOST_VIEWS:
-        raise CaptureError(
-            f"{folder} holds {count} places of the tripod, those of {TURNED}* included; at most {MOST_VIEWS} are "
-            "solved together. Remove those that show least."
-        )
-    return capture
+    return replace(capture, object_poses=tuple(anew))
 
 
 def folders_named(folder: Path, beginning: str) -> list[Path]:
@@ -112,10 +105,11 @@ def _refuse_unclear(folder: Path, views: list[Path], object_poses: list[Path]) -
             f"{folder} holds photos/ beside {views[0].name}/; each view's photos were needed in its own folder. Move "
             f"photos/ and its board photo into {VIEWS}{len(views) + 1}/, or remove it."
         )
-    if len(views) > MOST_VIEWS or len(object_poses) > MOST_OBJECT_POSES:
+    count = (len(views) or 1) + sum(len(folders_named(one, VIEWS)) or 1 for one in object_poses)
+    if count > MOST_VIEWS or len(object_poses) > MOST_OBJECT_POSES:
         raise CaptureError(
-            f"{folder} holds {len(views)} folders {VIEWS}* and {len(object_poses)} folders {TURNED}*; at most "
-            f"{MOST_VIEWS} and {MOST_OBJECT_POSES} are read. Remove those that show least."
+            f"{folder} holds {count} places of the tripod, those of {TURNED}* included; at most {MOST_VIEWS}, and "
+            f"{MOST_OBJECT_POSES} folders {TURNED}*, are solved together. Remove those that show least."
         )
 
 

@@ -2,8 +2,8 @@
 
 The light's direction shows in the ground's shading: the log brightness of coarse cells, relative to each cell's usual
 one, is a smooth field, fitted robustly so that object, shadows and a hand in view do not count. Frames are chosen so
-that these fields differ most; of frames with nearly the same light, the sharpest is chosen. A clip is read once,
-forwards; only coarse cells of at most MOST_CANDIDATES frames are stored.
+that these fields differ most. A clip is read once, forwards; only coarse cells of at most MOST_CANDIDATES frames are
+stored.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,6 @@ TOUCHED_S = 0.5  # at both ends: pressing the button shakes the camera
 SHARPNESS_PX = 960  # long side on which sharpness is measured: blur of one pixel of film still shows
 LOCAL_S = 1.5  # to either side: sharpness is compared with the local median, because light and shadows change it, too
 BLURRED = 0.7  # of that median
-STILL = 0.03  # change of log brightness from slot to slot below which nothing moves
 SAME_ROOM = 0.15  # log brightness: cells this close to the room-lit picture are lit by the room
 ROOM_SHARE = 0.4  # of the cells: an arm may hide the others while the object is placed
 BRIGHT = 0.5  # log brightness above the smooth field: the mark of a hand or of the flashlight itself in view
@@ -35,23 +34,9 @@ SHADOWED = 0.3  # log brightness below the field from which a cell is likely in 
 FIT_ROUNDS = 6  # of reweighting: the field settles to 1 %
 SAME_LIGHT = 0.04  # root mean square between two fields of log brightness: nearer ones are duplicates
 DARK_FRAMES = 5  # averaged, so that their noise does not enter every photo
-FEWEST_DARK = 3  # slots: a shorter dark time is a light that moves
+FEWEST_DARK, FEWEST_ROOM = 3, 3  # slots: a shorter time in the dark, or in room light, is a light that moves
 BOARD_FRAMES = 12  # of a clip of the board
 FEWEST_FRAMES = 4
-
-
-@dataclass(frozen=True)
-class ClipFrames:
-    """Frames by role. `board`: the tripod's view of the board in room light, at the clip's start."""
-
-    board: tuple[Path, ...]
-    lit: tuple[Path, ...]
-    dark: tuple[Path, ...]
-    note: str
-
-    def by_role(self) -> dict[str, tuple[Path, ...]]:
-        """Return the frames by the names of their roles."""
-        return {"board": self.board, "lit": self.lit, "dark": self.dark}
 
 
 @dataclass(frozen=True)
@@ -60,13 +45,12 @@ class _Candidates:
 
     times: Float[np.ndarray, " n"]
     sharpness: Float[np.ndarray, " n"]  # Laplacian energy over squared brightness
-    motion: Float[np.ndarray, " n"]  # change of the picture since the last examined frame, per second
     cells: Float[np.ndarray, "n cells"]  # linear brightness
     columns: int  # cells in a row
 
     def take(self, which: Bool[np.ndarray, " n"] | Int[np.ndarray, " k"]) -> "_Candidates":
         """Return some of them."""
-        chosen = (values[which] for values in (self.times, self.sharpness, self.motion, self.cells))
+        chosen = (values[which] for values in (self.times, self.sharpness, self.cells))
         return _Candidates(*chosen, self.columns)
 
     def log_cells(self) -> Float[np.ndarray, "n cells"]:
@@ -78,13 +62,12 @@ class _Candidates:
         near = np.abs(self.times[:, None] - self.times) <= LOCAL_S
         return self.sharpness / np.array([max(np.median(self.sharpness[row]), 1e-12) for row in near])
 
-    def quality(self) -> Float[np.ndarray, " n"]:
-        """Return a score, high for sharp frames in which the light moves slowly: motion blurs a shadow's edge."""
-        return self.local_sharpness() / (1 + self.motion / max(float(np.median(self.motion)), 1e-6))
 
-
-def choose_frames(clip: Path, count: int) -> ClipFrames:
+def choose_frames(clip: Path, count: int) -> tuple[dict[str, tuple[Path, ...]], str]:
     """Choose at most `count` frames under the flashlight, the board's frame at the start and frames without light.
+
+    Returns:
+        the frames by role (board, lit, dark), and a sentence on them.
 
     Raises:
         CaptureError: the clip cannot be read, or shows no moving flashlight.
@@ -106,20 +89,20 @@ def choose_frames(clip: Path, count: int) -> ClipFrames:
     keep = strange <= BRIGHT_SHARE
     if keep.sum() >= FEWEST_FRAMES:
         lit, fields = lit.take(keep), fields[keep]
-    chosen = _spread(fields, lit.quality(), count)
+    chosen = _spread(fields, lit.local_sharpness(), count)
     room = every.take(np.arange(n_room))
-    board = _still_and_sharp(room)
+    board = room.times[[np.argmax(room.sharpness)]] if n_room >= FEWEST_ROOM else np.zeros(0)
     dark = rest.times[is_dark] if is_dark.sum() >= FEWEST_DARK else np.zeros(0)
     dark = dark[np.linspace(0, len(dark) - 1, min(len(dark), DARK_FRAMES)).round().astype(int)]
     note = f"{clip.name}: {len(chosen)} frames chosen of {len(every.times)} examined, spread by the light's direction"
     note += ", the board in room light at its start" if len(board) else ""
     note += f", {len(dark)} with the light off" if len(dark) else ""
-    paths = [tuple(frame_path(clip, t) for t in times) for times in (board, lit.times[chosen], dark)]
-    return ClipFrames(*paths, note)
+    times = {"board": board, "lit": lit.times[chosen], "dark": dark}
+    return {role: tuple(frame_path(clip, t) for t in some) for role, some in times.items()}, note
 
 
 def choose_board_frames(clip: Path) -> tuple[Path, ...]:
-    """Choose sharp frames of a clip of the board whose pictures differ most, in their order.
+    """Choose sharp frames of a clip of the board, or without light, whose pictures differ most, in their order.
 
     Raises:
         CaptureError: the clip cannot be read.
@@ -127,19 +110,8 @@ def choose_board_frames(clip: Path) -> tuple[Path, ...]:
     every = _candidates(clip)
     sharp = every.take(every.local_sharpness() >= BLURRED)
     logs = sharp.log_cells()
-    chosen = _spread(logs - logs.mean(1, keepdims=True), sharp.quality(), BOARD_FRAMES)
+    chosen = _spread(logs - logs.mean(1, keepdims=True), sharp.local_sharpness(), BOARD_FRAMES)
     return tuple(frame_path(clip, t) for t in sharp.times[chosen])
-
-
-def choose_any_frames(clip: Path) -> tuple[Path, ...]:
-    """Choose a few evenly spaced frames of a clip that shows the same throughout.
-
-    Raises:
-        CaptureError: the clip cannot be read.
-    """
-    times = _candidates(clip).times
-    some = np.linspace(0, len(times) - 1, min(len(times), DARK_FRAMES)).round().astype(int)
-    return tuple(frame_path(clip, t) for t in times[some])
 
 
 def _no_light(clip: Path, n_all: int, n_lit: int) -> CaptureError:
@@ -153,18 +125,16 @@ def _candidates(clip: Path) -> _Candidates:
     """Find the sharpest frame of every slot of the clip, without its ends."""
     length = read_clip(clip).duration_s
     slot = max(SLOT_S, length / MOST_CANDIDATES)
-    found: list[tuple[float, float, float, np.ndarray]] = []
-    columns, last = 0, (0.0, np.zeros(0))
+    found: list[tuple[float, float, np.ndarray]] = []
+    columns = 0
     for time_s, frame in frames_of(clip, slot / LOOKS_PER_SLOT):
         grey = smaller(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), SHARPNESS_PX)
         thumbnail = smaller(grey, THUMBNAIL_PX)
         columns = thumbnail.shape[1] // CELL_PX
         energy = float((cv2.Laplacian(grey, cv2.CV_32F) ** 2).mean()) / max(float(grey.mean()), 1.0) ** 2
-        motion = _change(last, (time_s, thumbnail))
-        last = time_s, thumbnail
         is_new = not found or time_s >= found[-1][0] // slot * slot + slot
         if is_new or energy > found[-1][1]:
-            entry = (time_s, energy, motion, cells_of(decode_srgb(thumbnail)))
+            entry = (time_s, energy, cells_of(decode_srgb(thumbnail)))
             found = [*found, entry] if is_new else [*found[:-1], entry]
         if len(found) > 2 * MOST_CANDIDATES:  # the container does not state the clip's length
             found = [max(pair, key=lambda c: c[1]) for pair in zip(found[::2], found[1::2], strict=False)]
@@ -174,15 +144,8 @@ def _candidates(clip: Path) -> _Candidates:
         found = [entry for entry in found if TOUCHED_S <= entry[0] <= end]
     if not found:
         raise CaptureError(f"{clip} has no frame that can be decoded. Copy it again from the phone, or remove it.")
-    times, energies, motions, cells = zip(*found, strict=True)
-    return _Candidates(np.array(times), np.array(energies), np.array(motions), np.stack(cells), columns)
-
-
-def _change(before: tuple[float, np.ndarray], now: tuple[float, np.ndarray]) -> float:
-    """Return the mean change between two (time, picture), over their brightness, per second; 0 for the first one."""
-    if before[1].shape != now[1].shape or now[0] <= before[0]:
-        return 0.0
-    return float(cv2.absdiff(before[1], now[1]).mean()) / max(float(now[1].mean()), 1.0) / (now[0] - before[0])
+    times, energies, cells = zip(*found, strict=True)
+    return _Candidates(np.array(times), np.array(energies), np.stack(cells), columns)
 
 
 def _lit_by_room(frames: _Candidates, room: Float[np.ndarray, "k cells"]) -> Bool[np.ndarray, " n"]:
@@ -213,42 +176,19 @@ def _light_fields(lit: _Candidates) -> tuple[Float[np.ndarray, "n cells"], Float
 
 
 def _spread(
-    fields: Float[np.ndarray, "n cells"], quality: Float[np.ndarray, " n"], count: int
+    fields: Float[np.ndarray, "n cells"], sharpness: Float[np.ndarray, " n"], count: int
 ) -> Int[np.ndarray, " k"]:
-    """Return ascending indices of at most `count` fields far from one another: farthest-point sampling from the best.
-
-    Each choice then moves to the best frame within a quarter of the distance to the nearest other choice.
-    """
-    chosen = [int(np.argmax(quality))]
+    """Return ascending indices of at most `count` fields far from one another: farthest points, from the sharpest."""
+    chosen = [int(np.argmax(sharpness))]
     nearest = _distances(fields, chosen[0])
-    owner = np.zeros(len(fields), int)
     while len(chosen) < min(count, len(fields)):
         farthest = int(np.argmax(nearest))
         if nearest[farthest] < SAME_LIGHT:
             break
-        away = _distances(fields, farthest)
-        owner = np.where(away < nearest, len(chosen), owner)
-        nearest = np.minimum(nearest, away)
+        nearest = np.minimum(nearest, _distances(fields, farthest))
         chosen.append(farthest)
-    gaps = np.stack([_distances(fields[chosen], i) for i in range(len(chosen))])
-    np.fill_diagonal(gaps, np.inf)
-    final = []
-    for index, centre in enumerate(chosen):
-        reach = gaps[index].min() / 4 if len(chosen) > 1 else 0.0
-        around = np.flatnonzero((owner == index) & (_distances(fields, centre) <= reach))
-        final.append(int(around[np.argmax(quality[around])]) if len(around) else centre)
-    return np.array(sorted(final))
+    return np.array(sorted(chosen))
 
 
 def _distances(fields: Float[np.ndarray, "n cells"], index: int) -> Float[np.ndarray, " n"]:
     return np.sqrt(((fields - fields[index]) ** 2).mean(1))
-
-
-def _still_and_sharp(room: _Candidates) -> Float[np.ndarray, " k"]:
-    """Return the time of the sharpest frame of the room-lit start while nothing moves; a board has many edges."""
-    if len(room.times) < 3:
-        return np.zeros(0)
-    steps = np.percentile(np.abs(np.diff(room.log_cells(), axis=0)), 90, axis=1)
-    moves = np.maximum(np.append(steps, 0), np.insert(steps, 0, 0))
-    still = np.flatnonzero(moves <= max(STILL, float(moves.min())))
-    return room.times[still[[np.argmax(room.sharpness[still])]]]

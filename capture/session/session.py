@@ -17,7 +17,7 @@ from capture.files.names import is_clip_name, natural_order, refuse_no_folder, s
 from capture.files.regular import why
 from capture.files.schema import Number, Positive, Text, Vector, as_type
 from capture.photos.finding import Finding, grouped
-from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
+from capture.session.clip import choose_board_frames, choose_frames
 from capture.session.declared_objects import (
     MOST_LIGHTS,
     Cube,
@@ -255,8 +255,8 @@ def _roles(
         stills = replace(sound, by_role=sound.by_role | {"": []})
         roles, notes = sorted_roles(stills, seen)[0], ()
         for clip in clips:
-            frames = choose_frames(clip, settings.clip_frames)
-            roles, notes = _with_frames(roles, frames.by_role(), settings), (*notes, frames.note)
+            frames, note = choose_frames(clip, settings.clip_frames)
+            roles, notes = _with_frames(roles, frames, settings), (*notes, note)
         roles = replace(roles, board=(*roles.board, *loose))
     if is_sorted(folder):
         roles, notes = _with_clips(roles, folder, settings)
@@ -277,13 +277,12 @@ def _with_clips(roles: Roles, folder: Path, settings: SessionSettings) -> tuple[
     notes = tuple(f"{clip.parent.name}/{clip.name} was left out: there are photos beside it" for clip in unread)
     notes += tuple(f"side/{clip.name} was left out: photos are needed there, no clip" for clip in clips.get("side", ()))
     for clip in clips.get("lit", ()):
-        frames = choose_frames(clip, settings.clip_frames)
-        filmed = frames.by_role() | ({"dark": ()} if clips.get("dark") else {})
-        roles, notes = _with_frames(roles, filmed, settings), (*notes, frames.note)
+        frames, note = choose_frames(clip, settings.clip_frames)
+        roles, notes = _with_frames(roles, frames, settings), (*notes, note)
     for clip in clips.get("board", ()):
         roles = replace(roles, board=(*roles.board, *choose_board_frames(clip)))
     for clip in clips.get("dark", ()):
-        roles = replace(roles, dark=(*roles.dark, *choose_any_frames(clip)))
+        roles = replace(roles, dark=(*roles.dark, *choose_board_frames(clip)))
     return roles, notes
 
 

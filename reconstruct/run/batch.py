@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from calibration.scenes.importers import OF_A_CAPTURE, importers
+from calibration.scenes.importers import IMPORTERS, OF_A_CAPTURE
 from capture.decode.formats import is_photo_name
 from capture.errors import FOR_STUDIO, CaptureError, Remedy, UserError
 from capture.files.atomic import write_json
@@ -104,7 +104,7 @@ def looks_like_capture(folder: Path) -> bool:
         return True
     if any(is_photo_name(path) or is_clip_name(path) for path in folder.iterdir()):
         return True
-    return any(importer.recognises(folder) is not None for importer in importers())
+    return any(importer.recognises(folder) is not None for importer in IMPORTERS)
 
 
 def names_of(captures: Sequence[Path]) -> list[str]:
