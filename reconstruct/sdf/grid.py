@@ -90,18 +90,9 @@ class SdfGrid:
 
     def gradient(self, points: Float[Tensor, "n 3"], step: float = 0.5) -> Float[Tensor, "n 3"]:
         """Return the gradient at world points: central differences over step spacings each way; not normalised."""
-        tensors = (points, self.values)
-        if all(x.device.type == "cpu" and x.dtype == torch.float32 and not x.requires_grad for x in tensors):
-            places, out = (points.double() - self.origin.double()) / self.spacing, torch.empty_like(points)
-            gradients(self.blocks, np.ascontiguousarray(places.numpy()), step, out.numpy(), 0, len(points))
-            return out
-        offsets = step * self.spacing * torch.eye(3, dtype=points.dtype, device=points.device)
-        differences = [self.sdf(points + offset) - self.sdf(points - offset) for offset in offsets]
-        return torch.stack(differences, -1) / (2 * step * self.spacing)
-
-    def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
-        """Return no features, see reconstruct.shadowneus.field.SdfField."""
-        return points.new_zeros(len(points), 0)
+        places, out = (points.double() - self.origin.double()) / self.spacing, torch.empty_like(points)
+        gradients(self.blocks, np.ascontiguousarray(places.numpy()), step, out.numpy(), 0, len(points))
+        return out
 
     def _last(self) -> Float[Tensor, "3"]:
         return torch.tensor(self.values.shape, dtype=self.values.dtype, device=self.values.device) - 1

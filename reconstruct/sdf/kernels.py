@@ -338,25 +338,6 @@ def first_surfaces(phi, origins, directions, far, width, hit, part_t, part_f, st
         hit[r], part_t[r], part_f[r] = _first_surface(phi, x, y, z, dx, dy, dz, 0.0, far[r], width)
 
 
-@njit(forceinline=True, **INNER)
-def hash_uniform(seed, a, b):
-    """Return a uniform number in [0, 1) from three integers (splitmix64); without state, so any step is repeatable."""
-    x = np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(a) * np.uint64(0xBF58476D1CE4E5B9)
-    x = x + np.uint64(b) * np.uint64(0x94D049BB133111EB)
-    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    x = x ^ (x >> np.uint64(31))
-    return np.float64(x >> np.uint64(11)) * (1.0 / 9007199254740992.0)
-
-
-@njit(**UNCOUNTED)
-def uniforms(seed, a, step, out, start, stop):
-    """Fill rows start .. stop - 1 of out with uniform numbers from (seed, a, step * row + column)."""
-    for r in range(start, stop):
-        for c in range(out.shape[1]):
-            out[r, c] = hash_uniform(seed, a, step * r + c)
-
-
 EDGE, GROUND, OBJECT = 0, 1, 2  # content of a pixel: both or unknown, surely ground, surely object
 GRAZING = 0.15  # cosine below which the intersection's derivative along the ray is too large
 LEAST_SLOPE = 1e-6  # of the loss by the SDF at a point: less is not spread over the nodes
