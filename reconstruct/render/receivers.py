@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import RAYS_PER_BATCH, SHARPNESS_PER_VOXEL, visibility
+from reconstruct.sdf.rays import SHARPNESS_PER_VOXEL, visibility
 
 TURN_HASH = (12.9898, 78.233, 37.719)  # of a place, in voxels: neighbours get unrelated fractions
 
@@ -56,8 +56,7 @@ class Receivers:
         return out
 
     def _marched(self, starts: Float[Tensor, "m 3"], lights: Float[Tensor, "m 4"]) -> Float[Tensor, " m"]:
-        some = zip(starts.split(RAYS_PER_BATCH), lights.split(RAYS_PER_BATCH), strict=True)
-        return torch.cat([visibility(self.grid, s, k, SHARPNESS_PER_VOXEL / self.grid.spacing) for s, k in some])
+        return visibility(self.grid, starts, lights, SHARPNESS_PER_VOXEL / self.grid.spacing)
 
 
 def disc(samples: int) -> list[tuple[float, float]]:
