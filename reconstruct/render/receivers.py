@@ -26,7 +26,8 @@ class Receivers:
     def seen(self, lights: Float[Tensor, "n 4"], wanted: Bool[Tensor, " n"]) -> Float[Tensor, " n"]:
         """Return the visibility of each point's own homogeneous light, in [0, 1]; 0 where not wanted."""
         out = torch.zeros(len(self.points))
-        out[wanted] = self._marched(self.starts[wanted], lights[wanted])
+        sharpness = SHARPNESS_PER_VOXEL / self.grid.spacing
+        out[wanted] = visibility(self.grid, self.starts[wanted], lights[wanted], sharpness)
         return out
 
     def sees_whole_lamp(
@@ -50,13 +51,10 @@ class Receivers:
         """
         out = (directions @ self.normals.T).clamp_(min=0)
         for cosine, direction in zip(out, directions, strict=True):
-            place = torch.nonzero(self.grid.ball.may_hide(self.starts, direction) & (cosine > 0))[:, 0]
+            wanted = self.grid.ball.may_hide(self.starts, direction) & (cosine > 0)
             light = torch.cat([direction, torch.zeros(1)])
-            cosine[place] *= self._marched(self.starts[place], light.expand(len(place), 4))
+            cosine[wanted] *= self.seen(light.expand(len(wanted), 4), wanted)[wanted]
         return out
-
-    def _marched(self, starts: Float[Tensor, "m 3"], lights: Float[Tensor, "m 4"]) -> Float[Tensor, " m"]:
-        return visibility(self.grid, starts, lights, SHARPNESS_PER_VOXEL / self.grid.spacing)
 
 
 def disc(samples: int) -> list[tuple[float, float]]:

@@ -44,17 +44,11 @@ def crossings(field, places, crossed):
         for i in range(a * SIDE, min(a * SIDE + SIDE, nx)):
             for j in range(b * SIDE, min(b * SIDE + SIDE, ny)):
                 for k in range(c * SIDE, min(c * SIDE + SIDE, nz)):
-                    p, q, r = i & WITHIN, j & WITHIN, k & WITHIN
-                    here = pool[n, p, q, r] < 0
-                    east = pool[n, p + 1, q, r] if p < WITHIN else value_at(field, min(i + 1, nx - 1), j, k)
-                    north = pool[n, p, q + 1, r] if q < WITHIN else value_at(field, i, min(j + 1, ny - 1), k)
-                    above = pool[n, p, q, r + 1] if r < WITHIN else value_at(field, i, j, min(k + 1, nz - 1))
-                    if i + 1 < nx and (east < 0) != here:
-                        crossed[a, b, c] = crossed[(i + 1) >> SHIFT, b, c] = True
-                    if j + 1 < ny and (north < 0) != here:
-                        crossed[a, b, c] = crossed[a, (j + 1) >> SHIFT, c] = True
-                    if k + 1 < nz and (above < 0) != here:
-                        crossed[a, b, c] = crossed[a, b, (k + 1) >> SHIFT] = True
+                    here = pool[n, i & WITHIN, j & WITHIN, k & WITHIN] < 0
+                    for axis in range(3):
+                        p, q, r = i + (axis == 0), j + (axis == 1), k + (axis == 2)
+                        if p < nx and q < ny and r < nz and (value_at(field, p, q, r) < 0) != here:
+                            crossed[a, b, c] = crossed[p >> SHIFT, q >> SHIFT, r >> SHIFT] = True
 
 
 @njit(**FAST)
