@@ -74,8 +74,13 @@ class SdfGrid:
 
     @cached_property
     def ball(self) -> Ball:
-        """A ball that contains the object, to skip rays that miss it; made once."""
-        return ball_around(self.values, self.origin, self.spacing)
+        """A ball that contains every point at which the surface absorbs light from a ray; made once."""
+        nodes = torch.nonzero(self.values < self.spacing).float()  # the surface lies between two such nodes
+        if not len(nodes):
+            return Ball(self.origin, -torch.inf)
+        middle = (nodes.amax(0) + nodes.amin(0)) / 2
+        radius = float((nodes - middle).norm(dim=-1).max())
+        return Ball(self.origin + self.spacing * middle, self.spacing * (radius + REACH_VOXELS))
 
     def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """Return the trilinear SDF at world points; outside the box, the nearest value plus the distance to the box."""
@@ -96,13 +101,3 @@ class SdfGrid:
 
     def _last(self) -> Float[Tensor, "3"]:
         return torch.tensor(self.values.shape, dtype=self.values.dtype, device=self.values.device) - 1
-
-
-def ball_around(values: Float[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], spacing: float) -> Ball:
-    """Return a ball that contains every point at which the surface of an SdfGrid absorbs light from a ray."""
-    nodes = torch.nonzero(values < spacing).float()  # its surface lies between two such nodes
-    if not len(nodes):
-        return Ball(origin, -torch.inf)
-    middle = (nodes.amax(0) + nodes.amin(0)) / 2
-    radius = float((nodes - middle).norm(dim=-1).max())
-    return Ball(origin + spacing * middle, spacing * (radius + REACH_VOXELS))
