@@ -43,11 +43,8 @@ def pack(values: Float[np.ndarray, "nx ny nz"]) -> Blocks:
 
     Blocks whose cells are all +far or all -far are not stored; far is the largest absolute value.
     """
-    far, low, high = (
-        float(np.abs(values).max()),
-        values,
-        values,
-    )  # of the cells of each block: the least and the largest
+    far = float(np.abs(values).max())
+    low, high = values, values  # of the cells of each block: the least and the largest
     for axis, n in enumerate(values.shape):
         spans = [slice(first, first + SIDE + 1) for first in range(0, n, SIDE)]
         low = np.stack([np.moveaxis(low, axis, 0)[span].min(0) for span in spans], axis)
