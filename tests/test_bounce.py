@@ -20,7 +20,7 @@ from reconstruct.labels.ground_test import empty_ground_test
 from reconstruct.labels.ground_test import test_ground as ground_tested
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.photometric_stereo import label_object
-from reconstruct.render.g_buffer import albedo_at, look, seen_material
+from reconstruct.render.g_buffer import look, material_at, seen_material
 from reconstruct.render.interreflection import photo_interreflection, true_scale
 from reconstruct.render.radiosity import find_patches, nearest_patches
 from reconstruct.render.receivers import Receivers
@@ -160,7 +160,7 @@ def lit_scene(request):
     mesh = mesh_of(fields)
     normals = torch.from_numpy(np.array(mesh.vertex_normals)).float()
     points = torch.from_numpy(np.array(mesh.vertices)).float()
-    return fields, points, normals, soft_light(fields, seen_material(fields), mesh, normals)
+    return fields, points, normals, soft_light(seen_material(fields), mesh, normals)
 
 
 def test_what_lies_open_above_sees_all_of_the_sky_and_an_underside_none(lit_scene):
@@ -177,7 +177,7 @@ def test_four_numbers_tell_the_bounce_of_lamps_from_all_sides(lit_scene):
     fields, points, normals, soft = lit_scene
     patches = find_patches(fields.grid, fields.ground_height)
     assert patches is not None
-    albedo = albedo_at(fields, seen_material(fields), patches.points, patches.on_object)
+    albedo, _ = material_at(seen_material(fields), patches.points, patches.on_object)
     between = nearest_patches(patches, points, normals)
     at = Receivers(fields.grid, patches.points, patches.normals, patches.starts)
     for azimuth, elevation in ((0.3, 0.5), (2.5, 0.9), (4.4, 1.4)):

@@ -230,7 +230,7 @@ def test_a_solved_scene_of_two_object_poses_equals_its_file_and_knows_both_world
     assert float(view.grid.sdf(torch.tensor([lying()[0][1].centre], dtype=torch.float32)).item()) == pytest.approx(
         -14.0, abs=2.0
     )
-    points = seen_material(read).object_points  # those that the other pose's camera saw lie on the surface, too
+    points = seen_material(read).on_object.points  # those that the other pose's camera saw lie on the surface, too
     assert np.abs(read.grid.sdf(torch.from_numpy(points).float()).numpy()).mean() < 0.3
 
 

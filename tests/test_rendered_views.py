@@ -63,7 +63,6 @@ def test_views_and_an_object_pose_are_calibrated_in_their_boards_frames_and_a_pu
     assert pushed == ["IMG_0603.jpg"]
     checked = check_capture(source, photos, views)
     assert len(checked.further) == 2 and set(checked.readiness.facts["views"]) == {"view_1", "view_2", "view_3"}
-    assert 0.4 < checked.readiness.facts["surface_seen"] <= 1
     save_views(views, tmp_path / "calibration.json")
     assert load_views(tmp_path / "calibration.json").views[2].calibration == views.views[2].calibration
 

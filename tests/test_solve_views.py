@@ -15,7 +15,7 @@ from capture.errors import ReconstructionError
 from reconstruct.config import FitConfig, Level
 from reconstruct.fields import SolvedScene, load_fields, save_fields
 from reconstruct.labels.labels import assemble_labels
-from reconstruct.render.g_buffer import albedo_at, seen_material, surface_maps
+from reconstruct.render.g_buffer import material_at, seen_material, surface_maps
 from reconstruct.render.joined import join_views
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
@@ -120,7 +120,7 @@ def test_no_seam_is_left_where_the_sight_of_a_view_ends():
     joined = join_views(tilted)
     points = torch.from_numpy(points_on()).float()
     points = points[points[:, 2] > 20]
-    found = albedo_at(joined, seen_material(joined), points, torch.ones(len(points)) > 0).mean(-1).numpy()
+    found = material_at(seen_material(joined), points, torch.ones(len(points)) > 0)[0].mean(-1).numpy()
     low = np.linalg.norm(points.numpy() - SHAPES[0].centre, axis=1) < SHAPES[0].radius + 1e-3
     found, points = found[low], points[low]
     pairs = KDTree(points.numpy()).query_pairs(3.0, output_type="ndarray")

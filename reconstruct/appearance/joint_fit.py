@@ -129,18 +129,13 @@ def _grey_lobes(lobes: Float[Tensor, "lobes 3"]) -> Float[np.ndarray, "some 3"]:
     return every[lobes.any(-1)].double().numpy()
 
 
-def _arriving(samples: Samples, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n photos"]:
-    cosine = (samples.towards * normals[:, None]).sum(-1).clamp(min=0)
-    return cosine * samples.strength.mean(-1) + samples.indirect.mean(-1)
-
-
 def _predicted(
     samples: Samples, normals: Float[Tensor, "n 3"], albedo: Float[Tensor, " n"], lobes: Float[Tensor, "lobes 3"]
 ) -> Float[Tensor, "n photos"]:
     """Return the mean of RGB that unshadowed samples would have with these normals."""
-    diffuse = albedo[:, None] * _arriving(samples, normals)
+    cosine = (samples.towards * normals[:, None]).sum(-1).clamp(min=0)
+    diffuse = albedo[:, None] * (cosine * samples.strength.mean(-1) + samples.indirect.mean(-1))
     if not lobes.any():
         return diffuse
-    cosine = (samples.towards * normals[:, None]).sum(-1).clamp(min=0)
     mirrored = specular(lobes, normals[:, None], samples.towards, samples.eye[:, None]).mean(-1)
     return diffuse + mirrored * cosine * samples.strength.mean(-1)

@@ -1,34 +1,18 @@
-"""Coverage of the lights' directions and of the shadows on the ground: do the photos show all sides of the object?
+"""Coverage of the lights' directions and of the shadows on the ground: do the photos show all sides of the object?"""
 
-What share of the object's surface some view sees, and where one more view would see most: from silhouettes alone.
-
-The hull of all silhouettes stands for the object: a coarse grid of points that every view sees as object. Its surface
-is seen by a view that looks at it not too flatly and past no other part of the hull.
-"""
-
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import gaussian_filter, map_coordinates
 
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
-from calibration.light import Vector
 from calibration.posed_camera import PosedCamera
 from reconstruct.labels.field_ground_test import label_ground
 from reconstruct.labels.outline import dilated
 from reconstruct.scene import Scene, ground_points, reduced
 
-CELLS = 48  # along each side of the grid
-WIDER = 0.75  # half side of the grid, of the larger silhouette's size
-FLATTEST = 0.2  # cosine of the angle between normal and view: flatter, little is seen
-CLEAR_OF_SURFACE = 2.0  # cells: where a ray to a camera starts
-STEP = 1.0  # cells along that ray
-UNDERSIDE = 0.7  # normals that point down more steeply than this are the contact with the table
-TRIED_DEG = 15.0  # between places that are tried for the next view
 LEAST_APART = np.radians(30.0)  # of two views' directions
 LONG_SIDE = 240  # px: a shadow's area and place need no more
 KNOWN = 0.3  # confidence of a ground pixel's label from which it counts
@@ -48,106 +32,12 @@ SIDES = (
 )
 
 
-@dataclass(frozen=True)
-class SurfaceSeen:
-    """How much of the surface the views see together."""
-
-    share: float  # of the hull's surface
-    next_azimuth: float  # rad, world, from the object's middle: where one more view adds most
-    gain: float  # the share that it adds
-    close_pairs: tuple[tuple[str, str, float], ...]  # names of two views that look from nearly one direction, and rad
-
-
-def surface_seen(
-    views: CalibratedViews, masks: Sequence[Bool[np.ndarray, "height width"]], foot: Float[np.ndarray, "3"]
-) -> SurfaceSeen:
-    """Return what the views see of the hull of their silhouettes.
+def close_pairs(views: CalibratedViews, foot: Float[np.ndarray, "3"]) -> tuple[tuple[str, str, float], ...]:
+    """Return the names of views whose directions from the object are closer than LEAST_APART, and their angle, rad.
 
     Args:
-        masks: the object in each view, on any reduced grid of its photos.
-        foot: where it stands on the ground, world.
+        foot: where the object stands on the ground, world.
     """
-    cameras = [view.calibration.posed_camera for view in views.views]
-    small = [camera.resized(mask.shape[1], mask.shape[0]) for camera, mask in zip(cameras, masks, strict=True)]
-    half = WIDER * max(_size(camera, mask, foot) for camera, mask in zip(small, masks, strict=True))
-    hull, corner, cell = _hull(small, masks, foot, half)
-    points, normals = _surface(hull)
-    if not len(points):
-        return SurfaceSeen(0.0, 0.0, 0.0, _close_pairs(views, foot))
-    middle = corner + cell * points.mean(0)
-    seen = np.zeros(len(points), bool)
-    for camera in cameras:
-        seen |= _is_seen(hull, points, normals, (camera.centre - corner) / cell)
-    ways = [camera.centre - middle for camera in cameras]
-    away = float(np.median([np.linalg.norm(way) for way in ways]))
-    height = float(np.median([np.arcsin(way[2] / np.linalg.norm(way)) for way in ways]))
-    gains = {}
-    for azimuth in np.radians(np.arange(0, 360, TRIED_DEG)):
-        way = np.array([np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height)])
-        more = _is_seen(hull, points, normals, (middle + away * way - corner) / cell)
-        gains[float(azimuth)] = float((more & ~seen).mean())
-    best = max(gains, key=lambda azimuth: gains[azimuth])
-    return SurfaceSeen(float(seen.mean()), best, gains[best], _close_pairs(views, foot))
-
-
-def _size(camera: PosedCamera, mask: Bool[np.ndarray, "height width"], foot: Vector) -> float:
-    """Return the larger side of a silhouette at the object's distance, world."""
-    rows, columns = np.nonzero(mask)
-    if not len(rows):
-        return 0.0
-    return max(np.ptp(rows), np.ptp(columns)) * float(np.linalg.norm(foot - camera.centre)) / camera.camera.fx
-
-
-def _hull(
-    cameras: Sequence[PosedCamera], masks: Sequence[Bool[np.ndarray, "height width"]], foot: Vector, half: float
-) -> tuple[Float[np.ndarray, "n n n"], Vector, float]:
-    """Return the hull on a grid that stands on the ground (1 inside), the grid's first point and its spacing."""
-    cell = 2 * max(half, 1e-9) / (CELLS - 1)
-    corner = np.array([foot[0] - half, foot[1] - half, cameras[0].ground_height])
-    grid = np.stack(np.meshgrid(*[np.arange(CELLS)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    inside = np.ones(len(grid), bool)
-    for camera, mask in zip(cameras, masks, strict=True):
-        pixels, depth = camera.project_with_depth(corner + cell * grid)
-        at = np.round(pixels).astype(int)
-        shown = (depth > 0) & ((at >= 0) & (at < mask.shape[::-1])).all(1)
-        at = np.where(shown[:, None], at, 0)
-        inside &= shown & mask[at[:, 1], at[:, 0]]
-    return inside.reshape(CELLS, CELLS, CELLS).astype(float), corner, cell
-
-
-def _surface(hull: Float[np.ndarray, "n n n"]) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, "points 3"]]:
-    """Return points on the hull's surface and outward normals, in cells, without what rests on the table."""
-    smooth = gaussian_filter(np.pad(hull, 1), 1.0)[1:-1, 1:-1, 1:-1]
-    slope = np.stack(np.gradient(smooth), -1)
-    length = np.linalg.norm(slope, axis=-1)
-    rim = (hull > 0) & (smooth < 0.8) & (length > 1e-3)
-    normals = -slope[rim] / length[rim][:, None]
-    places = np.argwhere(rim).astype(float)
-    kept = (normals[:, 2] > -UNDERSIDE) & (places[:, 2] > 0)
-    return places[kept], normals[kept]
-
-
-def _is_seen(
-    hull: Float[np.ndarray, "n n n"],
-    points: Float[np.ndarray, "points 3"],
-    normals: Float[np.ndarray, "points 3"],
-    eye: Vector,
-) -> Bool[np.ndarray, " points"]:
-    """Return which points a camera at `eye` (cells) sees."""
-    way = eye - points
-    way = way / np.linalg.norm(way, axis=1, keepdims=True)
-    seen = (way * normals).sum(1) > FLATTEST
-    start, along = (points + CLEAR_OF_SURFACE * normals)[seen], way[seen]
-    blocked = np.zeros(len(start), bool)
-    for step in np.arange(0, np.sqrt(3) * CELLS, STEP):
-        at = start + step * along
-        blocked |= map_coordinates(hull, at.T, order=0, mode="constant") > 0
-    seen[seen] = ~blocked
-    return seen
-
-
-def _close_pairs(views: CalibratedViews, foot: Vector) -> tuple[tuple[str, str, float], ...]:
-    """Return the pairs of views whose directions from the object are closer than LEAST_APART."""
     ways = [view.calibration.world_from_camera.translation - foot for view in views.views]
     ways = [way / np.linalg.norm(way) for way in ways]
     found = []

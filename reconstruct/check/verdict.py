@@ -30,11 +30,10 @@ from reconstruct.check.light_coverage import (
     LEAST_APART,
     LONG_SIDE,
     ShadowCover,
+    close_pairs,
     directions,
     from_the_camera,
     shadow_cover,
-    side_in_words,
-    surface_seen,
     widest_gap,
 )
 from reconstruct.check.readiness import (
@@ -64,8 +63,6 @@ CLIPPED = 0.02  # of the object's samples that may be clipped
 GLOSSY = 0.08  # reflectance at normal incidence: twice that of plastic; interreflections then count
 POWER_CHANGED = 0.1  # log: lists of intensities are right within a few per cent
 NAMED = 4  # photos in a sentence
-MUCH_SEEN = 0.9  # of the surface that silhouettes leave: no further place is advised
-WORTH_A_VIEW = 0.05  # of that surface, that one more view would add
 ALL_LIT = 0.75  # of the photos with room light in their shadows: a changed exposure of some cannot cause it
 REASONS_SHOWN = 3
 
@@ -172,27 +169,17 @@ def judge_together(views: CalibratedViews, parts: Sequence[Readiness], covers: S
     judge_gap(say, facts["photos_used"], (start, gap), all_round, centre)
     if facts["photos_used"] < PLENTY:
         say("fair", f"{facts['photos_used']} photos: {PLENTY} or more show more of the shape", MORE_LIGHTS)
-    facts |= {"widest_gap_deg": float(np.degrees(gap))} | _judge_places(say, views, covers, centre)
+    facts |= {"widest_gap_deg": float(np.degrees(gap))}
+    _judge_places(say, views, centre)
     return verdict_of(say, facts)
 
 
-def _judge_places(
-    say: Judge, views: CalibratedViews, covers: Sequence[ShadowCover], centre: np.ndarray
-) -> dict[str, float]:
-    """Judge where the tripod stood; return the share of the surface that is seen, and what one more view adds."""
-    seen = surface_seen(views, [cover.mask for cover in covers], centre)
-    for one, other, angle in seen.close_pairs:
+def _judge_places(say: Judge, views: CalibratedViews, centre: np.ndarray) -> None:
+    """Judge where the tripod stood."""
+    for one, other, angle in close_pairs(views, centre):
         reason = f"{one} and {other} look from directions only {np.degrees(angle):.0f} degrees apart"
         apart = f"{np.degrees(LEAST_APART):.0f} degrees"
         say("fair", reason, f"Put the tripod at least {apart} farther around the object for another view.")
-    if len(views.views) < 2:  # the cone behind one silhouette is no object
-        return {}
-    if seen.share < MUCH_SEEN and seen.gain >= WORTH_A_VIEW:
-        side = side_in_words(seen.next_azimuth, views.first, centre)
-        reason = f"{seen.share:.0%} of the object's surface is seen by a view, as far as silhouettes tell"
-        more = f"with a view {side} (as seen in {views.views[0].name}) {seen.share + seen.gain:.0%} would be"
-        say("fair", reason, f"Put the tripod at one more place: {more}.")
-    return {"surface_seen": seen.share, "next_view_gain": seen.gain}
 
 
 def _facts_together(views: CalibratedViews, parts: Sequence[Readiness]) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from reconstruct.fields import SolvedScene
 from reconstruct.mesh.evidence import SEEN
 from reconstruct.mesh.mesh import vertex_colours
 from reconstruct.mesh.simplify import simplified
-from reconstruct.render.g_buffer import RenderView, SeenMaterial, SurfaceMaps, gloss_at, seen_material, surface_maps
+from reconstruct.render.g_buffer import RenderView, SeenMaterial, SurfaceMaps, material_at, seen_material, surface_maps
 from reconstruct.render.receivers import Receivers
 from reconstruct.render.relight import relight_soft
 from reconstruct.render.soft_light import SoftLight, ground_sky, soft_light
@@ -101,7 +101,7 @@ def stage_scene(run: StoredRun) -> StageScene:
         normal_picture,
         whole,
         mean,
-        soft_light(fields, material, small, torch.from_numpy(normals).float(), is_whole),
+        soft_light(material, small, torch.from_numpy(normals).float(), is_whole),
         ground_sky(fields, studio.centre, GROUND_HALF * studio.radius),
     )
 
@@ -142,7 +142,8 @@ def _gloss(
     if fields.gloss is None:
         return np.zeros((len(vertices), 0), np.uint8), 1.0
     points = torch.from_numpy(vertices).float()
-    weights = gloss_at(fields, material, points, torch.ones(len(vertices), dtype=torch.bool)).numpy()[:, :MOST_GLOSSY]
+    _, weights = material_at(material, points, torch.ones(len(vertices), dtype=torch.bool))
+    weights = weights.numpy()[:, :MOST_GLOSSY]
     scale = float(weights.max(initial=0.0)) or 1.0
     return np.round(FULL_WEIGHT * np.clip(weights / scale, 0, 1)).astype(np.uint8), scale
 

@@ -26,7 +26,7 @@ from reconstruct.labels.uneven_ground import Relief, ground_relief, near_ground
 from reconstruct.scene import Scene
 from reconstruct.sdf import carve_kernels as carve
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import run
+from reconstruct.sdf.rays import PerThread, run, thread_count
 from reconstruct.views import Scenes, each
 
 MAP_CELLS = 640  # of the ground maps along their longer side
@@ -136,7 +136,7 @@ def carve_grid(
             maps.origin,
             maps.cell,
             views[0][0].ground_height,
-            k,
+            PerThread(np.empty(k) for _ in range(thread_count())),
         )
     values = np.maximum(np.maximum(by_lights, by_camera), -1e3 * spacing)
     for scene, labels in views:

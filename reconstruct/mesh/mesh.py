@@ -19,7 +19,7 @@ from reconstruct.fields import SolvedScene
 from reconstruct.mesh.evidence import vertex_evidence
 from reconstruct.mesh.facets import faced, flipped
 from reconstruct.mesh.glb import Y_UP, metres, write_glb
-from reconstruct.render.g_buffer import albedo_at, gloss_at, seen_material, surface_maps
+from reconstruct.render.g_buffer import material_at, seen_material, surface_maps
 from reconstruct.sdf.grid import SdfGrid
 
 MAX_NODES = 400**3  # nodes around the object: beyond, marching cubes alone takes more than 2 GB
@@ -44,7 +44,7 @@ def extract_mesh(fields: SolvedScene, max_nodes: int = MAX_NODES) -> trimesh.Tri
     """
     mesh = surface_mesh(fields.grid, fields.ground_height, max_nodes, True, lambda: seen_points(fields))
     vertices = torch.from_numpy(np.asarray(mesh.vertices)).float()
-    albedo = albedo_at(fields, seen_material(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
+    albedo, _ = material_at(seen_material(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
     mesh.visual = ColorVisuals(mesh, vertex_colors=encode_srgb(albedo.numpy()))
     evidence = vertex_evidence(fields, np.asarray(mesh.vertices))
     if evidence is not None:
@@ -215,7 +215,7 @@ def mesh_material(fields: SolvedScene, mesh: trimesh.Trimesh) -> MetalRough | No
     if fields.gloss is None:
         return None
     vertices = torch.from_numpy(np.asarray(mesh.vertices)).float()
-    weights = gloss_at(fields, seen_material(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
+    _, weights = material_at(seen_material(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
     coefficients = torch.einsum("nm,mlc->nlc", weights, fields.gloss.lobes)
     return metal_rough(torch.from_numpy(decode_srgb(vertex_colours(mesh))), coefficients)
 

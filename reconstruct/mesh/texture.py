@@ -27,7 +27,7 @@ from reconstruct.detail.fit import DetailSample, detail_at
 from reconstruct.fields import SolvedScene
 from reconstruct.mesh.glb import Y_UP, material, packed
 from reconstruct.mesh.mesh import mesh_material
-from reconstruct.render.g_buffer import NEIGHBOURS, SAME_POINT, SeenMaterial, albedo_at, seen_material
+from reconstruct.render.g_buffer import NEIGHBOURS, SAME_POINT, SeenMaterial, material_at, seen_material
 
 WHITE_SHARE = 0.99  # of the pixels on the object are darker than what is drawn as BRIGHT
 BRIGHT = 0.8  # linear
@@ -345,7 +345,8 @@ class _SurfaceSampler:
         """Return linear base colour and unit normals of the surface near points of a simplified mesh."""
         on_surface, normals = _surface(self._fields, points, flat, is_base)
         where = torch.from_numpy(on_surface).float()
-        albedo = albedo_at(self._fields, self._seen_material, where, torch.ones(len(where), dtype=torch.bool)).numpy()
+        everywhere = torch.ones(len(where), dtype=torch.bool)
+        albedo = material_at(self._seen_material, where, everywhere)[0].numpy()
         base = albedo.clip(0, 1) if self._material is None else self._glossy_base(on_surface)
         if not self._details:
             return base, normals

@@ -5,6 +5,7 @@ A radiance map is equirectangular: row 0 around +z, column j at azimuth 2 pi (j 
 
 import math
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -63,16 +64,8 @@ def patch_power(
     """Return radiance * solid angle / pi summed over each patch, linear; a texel on an edge is divided by area."""
     height, width = radiance.shape[:2]
     texels = radiance.double() * (2 * band_height(height).double() / width)[:, None, None]
-    return _shared(_shared(texels, size[0]).transpose(0, 1), size[1]).transpose(0, 1).float()
-
-
-def _shared(values: Float[Tensor, " n *rest"], parts: int) -> Float[Tensor, " parts *rest"]:
-    """Sum values over equal parts of the first axis; a value on a boundary is split proportionally."""
-    running = torch.cat([torch.zeros_like(values[:1]), values.cumsum(0)])
-    edges = torch.arange(parts + 1, dtype=torch.float64) * len(values) / parts
-    low = edges.floor().long().clamp(max=len(values) - 1)
-    share = (edges - low).reshape(-1, *[1] * (values.ndim - 1))
-    return torch.lerp(running[low], running[low + 1], share).diff(dim=0)
+    mean = cv2.resize(texels.numpy(), size[::-1], interpolation=cv2.INTER_AREA).reshape(*size, -1)
+    return torch.from_numpy(mean * (height / size[0] * width / size[1])).float()
 
 
 def sky_size(radiance: Float[Tensor, "rows columns 3"], rows: int) -> tuple[int, int]:

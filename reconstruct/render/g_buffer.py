@@ -1,4 +1,4 @@
-"""The G-buffer of a solved scene: surface_maps (depth, normals, mask), albedo_at (of any point), look (both)."""
+"""The G-buffer of a solved scene: surface_maps (depth, normals, mask), material_at (of any point), look (both)."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -68,35 +68,72 @@ class RenderView:
 
 
 @dataclass(frozen=True)
+class SeenPoints:
+    """Points of object or ground that cameras see well, and what is known there. World frame."""
+
+    points: Float[np.ndarray, "seen 3"]
+    values: Float[np.ndarray, "seen channels"]  # albedo, and of the object the weights of Gloss, where there is one
+
+    @cached_property
+    def tree(self) -> KDTree:
+        """A search tree over the points, built once."""
+        return KDTree(self.points, balanced_tree=False, compact_nodes=False)  # from afar, eight times as fast
+
+    @cached_property
+    def means(self) -> tuple[KDTree, Float[np.ndarray, "cells channels"], float]:
+        """Means of the points in cells, CELLS along the longest side of their box, and of their values; cells' size."""
+        size = float(np.ptp(self.points, axis=0).max(initial=0.0)) / CELLS if len(self.points) else 0.0
+        cell, means = in_cells(self.points, size)
+        count = np.bincount(cell, minlength=len(means))
+        values = [np.bincount(cell, column, len(means)) / count for column in self.values.T]
+        return KDTree(means), np.stack(values, 1), size
+
+    def at(
+        self, points: Float[np.ndarray, "n 3"], otherwise: Float[np.ndarray, " channels"]
+    ) -> Float[np.ndarray, "n channels"]:
+        """Interpolate the values from the NEIGHBOURS nearest seen points, weighted by 1 / distance^2.
+
+        Points farther from them than NEAR take the wide average, in between a share of both.
+        """
+        seen = self.tree
+        if not seen.n or not len(points):
+            return np.broadcast_to(otherwise, (len(points), len(otherwise))).copy()
+        if seen.n == 1:
+            return np.broadcast_to(self.values, (len(points), self.values.shape[1])).copy()
+        size, has_wide = max(self.means[2], SAME_POINT), self.means[0].n > WIDE_NEIGHBOURS
+        asked = 2 * NEAR[1] * size if has_wide else np.inf  # from afar, many points are about as near: that takes long
+        distance, index = seen.query(points, k=min(NEIGHBOURS, seen.n), distance_upper_bound=asked, workers=-1)
+        distance, index = distance.reshape(len(points), -1), np.minimum(index, seen.n - 1).reshape(len(points), -1)
+        weight = 1 / np.maximum(distance, SAME_POINT) ** 2
+        total = np.maximum(weight.sum(1, keepdims=True), np.finfo(float).tiny)
+        out = ((weight / total)[:, :, None] * self.values[index]).sum(1)
+        away = np.clip((distance[:, 0] / size - NEAR[0]) / (NEAR[1] - NEAR[0]), 0, 1)
+        far = away > 0
+        if far.any() and has_wide:
+            share = (away[far] ** 2 * (3 - 2 * away[far]))[:, None]
+            out[far] += share * (self._from_means(points[far]) - out[far])
+        return out.astype(np.float32)
+
+    def _from_means(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n channels"]:
+        """Interpolate the cells' means at points far from all of them.
+
+        Weights are ((R - d) / (R d))^2 with R the distance to the last neighbour [Franke and Nielson 1980]: a neighbour
+        that comes or goes has weight 0, so that nothing jumps where another set of neighbours begins.
+        """
+        tree, means, _ = self.means
+        distance, index = tree.query(points, k=WIDE_NEIGHBOURS, workers=-1)
+        last = distance[:, -1:]
+        weight = ((last - distance) / (last * np.maximum(distance, SAME_POINT))) ** 2 + SAME_POINT**4
+        return ((weight / weight.sum(1, keepdims=True))[:, :, None] * means[index]).sum(1)
+
+
+@dataclass(frozen=True)
 class SeenMaterial:
     """Material of the points that the capture cameras see well, away from outlines and grazing views."""
 
-    object_points: Float[np.ndarray, "seen 3"]  # world
-    object_albedo: Float[np.ndarray, "seen 3"]
-    object_gloss: Float[np.ndarray, "seen materials"]  # weights of Gloss; no columns where there is none
-    ground_points: Float[np.ndarray, "ground 3"]
-    ground_albedo: Float[np.ndarray, "ground 3"]
+    on_object: SeenPoints
+    on_ground: SeenPoints
     fields: SolvedScene  # that it was made of
-
-    @cached_property
-    def object_tree(self) -> KDTree:
-        """A search tree over the object's points, built once."""
-        return KDTree(self.object_points, balanced_tree=False, compact_nodes=False)  # from afar, eight times as fast
-
-    @cached_property
-    def ground_tree(self) -> KDTree:
-        """A search tree over the ground's points, built once."""
-        return KDTree(self.ground_points, balanced_tree=False, compact_nodes=False)
-
-    @cached_property
-    def object_means(self) -> "CellMeans":
-        """Cells of the object's points, made once."""
-        return cell_means(self.object_points)
-
-    @cached_property
-    def ground_means(self) -> "CellMeans":
-        """Cells of the ground's points, made once."""
-        return cell_means(self.ground_points)
 
     @cached_property
     def patches(self) -> tuple[Patches, Float[Tensor, "patches 3"]] | None:
@@ -104,28 +141,7 @@ class SeenMaterial:
         found = find_patches(self.fields.grid, self.fields.ground_height) if self.fields.interreflection > 0 else None
         if found is None:
             return None
-        return found, self.fields.interreflection * albedo_at(self.fields, self, found.points, found.on_object)
-
-
-@dataclass(frozen=True)
-class CellMeans:
-    """Seen points, averaged over the cells of a grid."""
-
-    tree: KDTree  # of the means of the points
-    cell: Integer[np.ndarray, " seen"]  # of each point
-    size: float  # of a cell, world length
-
-    def of(self, values: Float[np.ndarray, "seen channels"]) -> Float[np.ndarray, "cells channels"]:
-        """Return the mean of the points' values in each cell."""
-        count = np.bincount(self.cell, minlength=self.tree.n)
-        return np.stack([np.bincount(self.cell, column, self.tree.n) / count for column in values.T], 1)
-
-
-def cell_means(points: Float[np.ndarray, "seen 3"]) -> CellMeans:
-    """Sort points into cells, CELLS along the longest side of their box."""
-    size = float(np.ptp(points, axis=0).max(initial=0.0)) / CELLS if len(points) else 0.0
-    cell, means = in_cells(points, size)
-    return CellMeans(KDTree(means), cell, size)
+        return found, self.fields.interreflection * material_at(self, found.points, found.on_object)[0]
 
 
 def in_cells(
@@ -194,8 +210,9 @@ def seen_material(fields: SolvedScene) -> SeenMaterial:
     are used.
     """
     parts = [_seen_by_one(view) for view in fields.views()]
-    names = ("object_points", "object_albedo", "object_gloss", "ground_points", "ground_albedo")
-    return SeenMaterial(*(np.concatenate([getattr(part, name) for part in parts]) for name in names), fields)
+    both = [[getattr(part, name) for part in parts] for name in ("on_object", "on_ground")]
+    joined = [[np.concatenate([getattr(own, x) for own in some]) for x in ("points", "values")] for some in both]
+    return SeenMaterial(*(SeenPoints(*own) for own in joined), fields)
 
 
 def _seen_by_one(fields: SolvedScene) -> SeenMaterial:
@@ -218,7 +235,8 @@ def _seen_by_one(fields: SolvedScene) -> SeenMaterial:
     if fields.object_from_world is not None:  # of another object pose: its ground is not that of the scene
         points = fields.in_common(points.reshape(-1, 3).astype(float)).reshape(points.shape).astype(np.float32)
         ground = np.zeros_like(ground)
-    return SeenMaterial(points[trusted], albedo[trusted], gloss[trusted], points[ground], albedo[ground], fields)
+    on_object = SeenPoints(points[trusted], np.concatenate([albedo, gloss], -1)[trusted])
+    return SeenMaterial(on_object, SeenPoints(points[ground], albedo[ground]), fields)
 
 
 def away_from_outlines(
@@ -245,81 +263,25 @@ def finite(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "heigh
     return np.where(np.isfinite(depth), depth, 0).astype(np.float32)
 
 
-def albedo_at(
-    fields: SolvedScene, material: SeenMaterial, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
-) -> Float[Tensor, "n 3"]:
-    """Return the linear albedo of world points on the surface.
+def material_at(
+    material: SeenMaterial, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n materials"]]:
+    """Return the linear albedo of world points on the surface, and their weights of Gloss, 0 on the ground.
 
     A point on the object takes the weighted mean of its nearest object points (in 3-D) that a capture camera sees;
     far from them, that of the means of cells around it, which changes without a seam. Ground inside the photo takes
     seen ground in the same way; ground outside the photo takes the mean of all seen ground.
     """
-    out = np.zeros((len(points), 3), np.float32)
+    seen, ground = material.on_object, material.on_ground
     where, is_object = points.numpy(), on_object.numpy()
-    mean = material.ground_albedo.mean(0) if len(material.ground_albedo) else np.full(3, 0.5, np.float32)
-    seen = material.object_tree, material.object_means, material.object_albedo
-    out[is_object] = _nearest(*seen, where[is_object], mean)
-    inside = _inside_photo(fields, where) & ~is_object
-    out[~is_object] = mean
-    out[inside] = _nearest(material.ground_tree, material.ground_means, material.ground_albedo, where[inside], mean)
-    return torch.from_numpy(out)
-
-
-def gloss_at(
-    fields: SolvedScene, material: SeenMaterial, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
-) -> Float[Tensor, "n materials"]:
-    """Return the lobe weights of `fields.gloss` at world points, found as in albedo_at; 0 on the ground."""
-    assert fields.gloss is not None
-    out = torch.zeros(len(points), len(fields.gloss.lobes))
-    mean = np.zeros(out.shape[1], np.float32)
-    where = points[on_object].numpy()
-    seen = material.object_tree, material.object_means, material.object_gloss
-    out[on_object] = torch.from_numpy(_nearest(*seen, where, mean))
-    return out
-
-
-def _nearest(
-    seen: KDTree,
-    means: CellMeans,
-    values: Float[np.ndarray, "m channels"],
-    points: Float[np.ndarray, "n 3"],
-    otherwise: Float[np.ndarray, " channels"],
-) -> Float[np.ndarray, "n channels"]:
-    """Interpolate values at points from the NEIGHBOURS nearest seen points, weighted by 1 / distance^2.
-
-    Points farther from them than NEAR take the wide average, in between a share of both.
-    """
-    if not seen.n or not len(points):
-        return np.broadcast_to(otherwise, (len(points), len(otherwise))).copy()
-    if seen.n == 1:
-        return np.broadcast_to(values, (len(points), values.shape[1])).copy()
-    size, has_wide = max(means.size, SAME_POINT), means.tree.n > WIDE_NEIGHBOURS
-    asked = 2 * NEAR[1] * size if has_wide else np.inf  # from afar, many points are about as near: that takes long
-    distance, index = seen.query(points, k=min(NEIGHBOURS, seen.n), distance_upper_bound=asked, workers=-1)
-    distance, index = distance.reshape(len(points), -1), np.minimum(index, seen.n - 1).reshape(len(points), -1)
-    weight = 1 / np.maximum(distance, SAME_POINT) ** 2
-    total = np.maximum(weight.sum(1, keepdims=True), np.finfo(float).tiny)
-    out = ((weight / total)[:, :, None] * values[index]).sum(1)
-    away = np.clip((distance[:, 0] / size - NEAR[0]) / (NEAR[1] - NEAR[0]), 0, 1)
-    far = away > 0
-    if far.any() and has_wide:
-        share = (away[far] ** 2 * (3 - 2 * away[far]))[:, None]
-        out[far] += share * (_wide(means, values, points[far]) - out[far])
-    return out.astype(np.float32)
-
-
-def _wide(
-    means: CellMeans, values: Float[np.ndarray, "m channels"], points: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n channels"]:
-    """Interpolate the cells' means at points far from all of them.
-
-    Weights are ((R - d) / (R d))^2 with R the distance to the last neighbour [Franke and Nielson 1980]: a neighbour
-    that comes or goes has weight 0, so that nothing jumps where another set of neighbours begins.
-    """
-    distance, index = means.tree.query(points, k=WIDE_NEIGHBOURS, workers=-1)
-    last = distance[:, -1:]
-    weight = ((last - distance) / (last * np.maximum(distance, SAME_POINT))) ** 2 + SAME_POINT**4
-    return ((weight / weight.sum(1, keepdims=True))[:, :, None] * means.of(values)[index]).sum(1)
+    mean = ground.values.mean(0) if len(ground.values) else np.full(3, 0.5, np.float32)
+    nothing = np.zeros(seen.values.shape[1] - 3, np.float32)
+    out = np.tile(np.concatenate([mean, nothing]), (len(points), 1))
+    out[is_object] = seen.at(where[is_object], np.concatenate([mean, nothing]))
+    inside = _inside_photo(material.fields, where) & ~is_object
+    out[inside, :3] = ground.at(where[inside], mean)
+    albedo, gloss = np.split(out, [3], 1)
+    return torch.from_numpy(np.ascontiguousarray(albedo)), torch.from_numpy(np.ascontiguousarray(gloss))
 
 
 def _inside_photo(fields: SolvedScene, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
@@ -355,7 +317,7 @@ def look(
     seen = torch.isfinite(maps.depth)
     where = maps.points[seen], maps.mask[seen]
     albedo = torch.zeros_like(maps.points)
-    albedo[seen] = albedo_at(fields, material, *where)
+    albedo[seen], of_seen = material_at(material, *where)
     eye = torch.from_numpy(posed_camera.centre).float()
     interreflection, gloss = None, None
     if material.patches is not None:
@@ -364,6 +326,6 @@ def look(
         )
     if fields.gloss is not None:
         weights = torch.zeros(*maps.depth.shape, len(fields.gloss.lobes))
-        weights[seen] = gloss_at(fields, material, *where)
+        weights[seen] = of_seen
         gloss = Gloss(fields.gloss.lobes, weights)
     return RenderView(maps, albedo, fields.grid, eye, gloss, interreflection)

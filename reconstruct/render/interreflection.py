@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from reconstruct.fields import SolvedScene
-from reconstruct.render.g_buffer import SurfaceMaps, albedo_at, seen_material, surface_maps
+from reconstruct.render.g_buffer import SurfaceMaps, material_at, seen_material, surface_maps
 from reconstruct.render.radiosity import Patches, find_patches, nearest_patches
 from reconstruct.scene import Scene, irradiance
 from reconstruct.sdf.rays import shadow_starts, unshadowed
@@ -45,7 +45,7 @@ def photo_interreflection(fields: SolvedScene, scene: Scene) -> PhotoInterreflec
     found = find_patches(fields.grid, scene.ground_height if scene.ground_known else None)
     if found is None:
         return None
-    albedo = albedo_at(fields, seen_material(fields), found.points, found.on_object)
+    albedo, _ = material_at(seen_material(fields), found.points, found.on_object)
     towards, strength = irradiance(scene, found.points)
     share = (towards * found.normals).sum(-1).clamp(min=0) * unshadowed(fields.grid, found.starts, scene.lights)
     return PhotoInterreflection(found, torch.stack([found.bounced(albedo, e) for e in strength * share[..., None]]))

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from reconstruct.appearance.brdf import Gloss
@@ -17,7 +18,6 @@ FEATHER = 0.06  # of the object's size in the picture: its weight grows so far f
 SHARED = 0.05  # of the largest weight: of points that compare two views' scales
 FEWEST_SHARED = 50  # pixels; fewer do not compare them
 MOST_COMPARED = 20_000  # pixels of each view, which tell the scales to a thousandth
-REMAP_COLUMNS = 4096  # OpenCV takes pictures of less than 32768
 DARKEST = 1e-3  # albedo below which no ratio is known
 
 
@@ -42,7 +42,7 @@ class _View:
         """
         uv, depth = self.fields.posed_camera.project_with_depth(self.fields.in_world(points))
         uv = np.where((depth > 0)[:, None], uv, -10.0)
-        front = _sampled(finite(self.maps.depth.numpy()), uv, cv2.INTER_NEAREST)
+        front = _sampled(finite(self.maps.depth.numpy()), uv, 0)
         weight = _sampled(self.weight, uv)
         channels = [_sampled(channel * self.weight, uv) for channel in np.moveaxis(self.values, 2, 0)]
         seen = (weight > 0) & (depth > 0) & (depth < front + tolerance)
@@ -166,12 +166,7 @@ def _blended(views: Sequence[_View], number: int, tolerance: float) -> Float[np.
 
 
 def _sampled(
-    image: Float[np.ndarray, "height width"], uv: Float[np.ndarray, "n 2"], way: int = cv2.INTER_LINEAR
+    image: Float[np.ndarray, "height width"], uv: Float[np.ndarray, "n 2"], order: int = 1
 ) -> Float[np.ndarray, " n"]:
-    """Return an image's values at pixels; 0 outside."""
-    rows = -(-len(uv) // REMAP_COLUMNS)
-    at = np.full((rows * REMAP_COLUMNS, 2), -10, np.float32)
-    at[: len(uv)] = uv
-    at = at.reshape(rows, REMAP_COLUMNS, 2)
-    found = cv2.remap(np.ascontiguousarray(image, np.float32), at[..., 0], at[..., 1], way, borderValue=0)
-    return found.reshape(-1)[: len(uv)]
+    """Return an image's values at pixels, between them linear or, of order 0, the nearest; 0 outside."""
+    return map_coordinates(image, uv[:, ::-1].T, order=order, mode="grid-constant")

@@ -144,7 +144,8 @@ def _hit_patches(
     places, starts, axis = patches.points[lit], patches.starts[lit], patches.normals[lit]
     one, other = across(axis, places / grid.spacing)
     out = torch.full((len(lit), DIRECTIONS), len(patches.points))
-    nearest = _PatchSearch(patches)
+    ours = [torch.nonzero(patches.on_object == which)[:, 0] for which in (False, True)]  # of the ground, of the object
+    trees = [KDTree(patches.points[own].numpy()) for own in ours]
     for k, (x, y) in enumerate(disc(DIRECTIONS)):
         towards = normalize(x * one + y * other + (1 - x * x - y * y) ** 0.5 * axis, dim=-1)
         to_object = find_surface(grid, starts, towards)
@@ -155,21 +156,7 @@ def _hit_patches(
             on_object[:, None], starts + to_object[:, None] * towards, places + to_ground[:, None] * towards
         )
         hit = torch.isfinite(torch.minimum(to_object, to_ground))
-        out[hit, k] = nearest(points[hit], on_object[hit])
+        for which, (own, tree) in enumerate(zip(ours, trees, strict=True)):
+            theirs = hit & (on_object == bool(which))
+            out[theirs, k] = own[torch.from_numpy(np.asarray(tree.query(points[theirs].numpy())[1]))]
     return out
-
-
-class _PatchSearch:
-    """Search for the nearest patch: object patches for object points, ground patches for ground points."""
-
-    def __init__(self, patches: Patches):
-        ours = [torch.nonzero(patches.on_object == which)[:, 0] for which in (False, True)]
-        self._known = [(index, KDTree(patches.points[index].numpy())) for index in ours]
-
-    def __call__(self, points: Float[Tensor, "m 3"], on_object: Bool[Tensor, " m"]) -> Int[Tensor, " m"]:
-        out = torch.zeros(len(points), dtype=torch.long)
-        for which, (ours, tree) in enumerate(self._known):
-            theirs = on_object == bool(which)
-            _, nearest = tree.query(points[theirs].numpy())
-            out[theirs] = ours[torch.from_numpy(np.asarray(nearest))]
-        return out

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import RAYS_PER_BATCH, SHARPNESS_PER_VOXEL, visibility
+from reconstruct.sdf.rays import SHARPNESS_PER_VOXEL, visibility
 
 TURN_HASH = (12.9898, 78.233, 37.719)  # of a place, in voxels: neighbours get unrelated fractions
 
@@ -26,7 +26,8 @@ class Receivers:
     def seen(self, lights: Float[Tensor, "n 4"], wanted: Bool[Tensor, " n"]) -> Float[Tensor, " n"]:
         """Return the visibility of each point's own homogeneous light, in [0, 1]; 0 where not wanted."""
         out = torch.zeros(len(self.points))
-        out[wanted] = self._marched(self.starts[wanted], lights[wanted])
+        sharpness = SHARPNESS_PER_VOXEL / self.grid.spacing
+        out[wanted] = visibility(self.grid, self.starts[wanted], lights[wanted], sharpness)
         return out
 
     def sees_whole_lamp(
@@ -50,14 +51,10 @@ class Receivers:
         """
         out = (directions @ self.normals.T).clamp_(min=0)
         for cosine, direction in zip(out, directions, strict=True):
-            place = torch.nonzero(self.grid.ball.may_hide(self.starts, direction) & (cosine > 0))[:, 0]
+            wanted = self.grid.ball.may_hide(self.starts, direction) & (cosine > 0)
             light = torch.cat([direction, torch.zeros(1)])
-            cosine[place] *= self._marched(self.starts[place], light.expand(len(place), 4))
+            cosine[wanted] *= self.seen(light.expand(len(wanted), 4), wanted)[wanted]
         return out
-
-    def _marched(self, starts: Float[Tensor, "m 3"], lights: Float[Tensor, "m 4"]) -> Float[Tensor, " m"]:
-        some = zip(starts.split(RAYS_PER_BATCH), lights.split(RAYS_PER_BATCH), strict=True)
-        return torch.cat([visibility(self.grid, s, k, SHARPNESS_PER_VOXEL / self.grid.spacing) for s, k in some])
 
 
 def disc(samples: int) -> list[tuple[float, float]]:

@@ -187,10 +187,9 @@ def _glossy(
     direct: Float[Tensor, "n 3"],
     blur: float = 0.0,
 ) -> Float[Tensor, "n 3"]:
-    """Return the specular radiance of the pixels set in `lit`, for the irradiance `direct`; 0 in matt scenes."""
+    """Return the specular radiance of the pixels set in `lit`, for the irradiance `direct`."""
+    assert view.gloss is not None
     out = torch.zeros_like(direct)
-    if view.gloss is None:
-        return out
     shiny = torch.nonzero((view.gloss.weights[lit] > 0).any(-1) & (direct > 0).any(-1))[:, 0]
     points, normals, weights = view.maps.points[lit], view.maps.normals[lit], view.gloss.weights[lit]
     for some in shiny.split(PIXELS_AT_ONCE):
@@ -245,9 +244,8 @@ def _sky_rays(
 
 def _evenness(view: RenderView, lit: Bool[Tensor, "height width"], size: tuple[int, int]) -> Float[Tensor, "n 3"]:
     """Return the exact lobe reflectance of a uniform map over its sum over patches, a correction factor."""
+    assert view.gloss is not None
     out = torch.ones(int(lit.sum()), 3)
-    if view.gloss is None:
-        return out
     normals, weights = view.maps.normals[lit], view.gloss.weights[lit]
     summed = torch.zeros_like(out)
     directions, solid_angle = patches(size)

@@ -16,11 +16,11 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from reconstruct.fields import SolvedScene
-from reconstruct.render.g_buffer import SeenMaterial, albedo_at
+from reconstruct.render.g_buffer import SeenMaterial, material_at
 from reconstruct.render.radiosity import Patches, find_patches, nearest_patches
 from reconstruct.render.receivers import Receivers, across, disc
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import RAYS_PER_BATCH, find_surface, shadow_starts
+from reconstruct.sdf.rays import find_surface, shadow_starts
 
 RAYS = 64  # of a point: each stands for 1/64 of the light on it; its neighbours' means take the grain away
 LAMPS = 48  # directions over the hemisphere that four numbers are fitted to
@@ -54,26 +54,22 @@ class SoftLight:
 
 
 def soft_light(
-    fields: SolvedScene,
-    material: SeenMaterial,
-    mesh: trimesh.Trimesh,
-    normals: Float[Tensor, "n 3"],
-    has_below: bool = False,
+    material: SeenMaterial, mesh: trimesh.Trimesh, normals: Float[Tensor, "n 3"], has_below: bool = False
 ) -> SoftLight:
-    """Return the soft light at a mesh's vertices above its ground.
+    """Return the soft light at the vertices of a scene's mesh, above its ground.
 
     Args:
         normals: of the vertices, unit, outward.
         has_below: whether it is seen from below, too.
     """
-    points = torch.from_numpy(np.asarray(mesh.vertices)).float()
+    points, grid = torch.from_numpy(np.asarray(mesh.vertices)).float(), material.fields.grid
     mean = _NeighbourMeans(mesh)
-    sky = mean(sky_share(fields.grid, points, normals, on_object=True))
-    below = mean(sky_share(fields.grid, points, normals, on_object=True, up=-1.0)) if has_below else None
-    patches, albedo = material.patches or _patches(fields, material)
+    sky = mean(sky_share(grid, points, normals, on_object=True))
+    below = mean(sky_share(grid, points, normals, on_object=True, up=-1.0)) if has_below else None
+    patches, albedo = material.patches or _patches(material)
     if patches is None:
         return SoftLight(sky, torch.zeros(len(points), 4), torch.ones(len(points), 3), below)
-    sent, usual = _sent_on(patches, fields.grid)
+    sent, usual = _sent_on(patches, grid)
     per_channel = torch.stack(
         [patches.bounced(albedo, sent[:, k, None].expand(-1, 3)) for k in range(4)], 1
     )  # patches, 4, RGB
@@ -111,9 +107,8 @@ def sky_share(
         towards = x * one + y * other + (1 - x * x - y * y) ** 0.5 * normals
         light = overcast(up * towards[:, 2])
         asked = torch.nonzero(light > 0)[:, 0]
-        for some in asked.split(RAYS_PER_BATCH):
-            is_open = torch.isinf(find_surface(grid, starts[some], towards[some]))
-            out[some] += light[some] * is_open / RAYS
+        is_open = torch.isinf(find_surface(grid, starts[asked], towards[asked]))
+        out[asked] += light[asked] * is_open / RAYS
     return out
 
 
@@ -148,12 +143,12 @@ def ground_sky(fields: SolvedScene, centre: Float[np.ndarray, "3"], half: float)
     return cv2.blur(share, (3, 3))
 
 
-def _patches(fields: SolvedScene, material: SeenMaterial) -> tuple[Patches | None, Float[Tensor, "patches 3"]]:
+def _patches(material: SeenMaterial) -> tuple[Patches | None, Float[Tensor, "patches 3"]]:
     """Return the scene's patches with the albedo as it was found, where photos did not tell its scale."""
-    found = find_patches(fields.grid, fields.ground_height)
+    found = find_patches(material.fields.grid, material.fields.ground_height)
     if found is None:
         return None, torch.zeros(0, 3)
-    return found, albedo_at(fields, material, found.points, found.on_object)
+    return found, material_at(material, found.points, found.on_object)[0]
 
 
 def _sent_on(patches: Patches, grid: SdfGrid) -> tuple[Float[Tensor, "patches 4"], Float[Tensor, "4"]]:

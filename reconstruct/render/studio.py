@@ -11,7 +11,7 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from reconstruct.fields import SolvedScene
-from reconstruct.render.g_buffer import RenderView, look, seen_material
+from reconstruct.render.g_buffer import RenderView, SeenPoints, look, seen_material
 from reconstruct.render.relight import relight_soft
 
 FILL = 1.05  # diameter of the bounding sphere over the picture's height: most objects fill two thirds of their sphere
@@ -104,10 +104,10 @@ def turntable(
 ) -> Iterator[Float[np.ndarray, "height width 3"]]:
     """Yield linear pictures of one full turn of the object before fixed camera and lamp; the sequence loops."""
     material = seen_material(fields)
-    ground = material.ground_albedo
+    ground = material.on_ground.values
     mean = ground.mean(0, keepdims=True) if len(ground) else np.full((1, 3), 0.5, np.float32)
     # The photo shows only a part of the ground, so all of it gets the mean of what is seen.
-    material = replace(material, ground_points=np.zeros((1, 3), np.float32), ground_albedo=mean)
+    material = replace(material, on_ground=SeenPoints(np.zeros((1, 3), np.float32), mean))
     first = direction_of(fields.posed_camera.centre - studio.centre)[0]
     for k in range(frames):
         turn = 2 * np.pi * k / frames

@@ -1,8 +1,7 @@
-"""Fill, unpack and move the blocks of a grid, and find where the surface crosses them. Numba; see blocks.py."""
+"""Find where the surface crosses the blocks of a grid, and join each with its neighbours. Numba; see blocks.py."""
 
 import math
 
-import numpy as np
 from numba import njit
 
 from reconstruct.sdf.kernels import FAST, INNER, SHIFT, SIDE, WITHIN
@@ -36,58 +35,6 @@ def eikonal(x, y, z, spacing):
     return d
 
 
-@njit(**INNER)
-def _is_even(values, i, j, k):
-    """Return whether all cells of the block that begins at a node have the same value."""
-    nx, ny, nz = values.shape
-    first = values[i, j, k]
-    for p in range(i, min(i + SIDE + 1, nx)):
-        for q in range(j, min(j + SIDE + 1, ny)):
-            for r in range(k, min(k + SIDE + 1, nz)):
-                if values[p, q, r] != first:
-                    return False
-    return True
-
-
-@njit(**FAST)
-def survey(values, far, stored, inside):
-    """Mark as stored the blocks with a cell that is not +-far everywhere, and as inside those whose first node is."""
-    for a, b, c in np.ndindex(stored.shape):
-        i, j, k = a * SIDE, b * SIDE, c * SIDE
-        inside[a, b, c] = values[i, j, k] < 0
-        stored[a, b, c] = abs(values[i, j, k]) < far or not _is_even(values, i, j, k)
-
-
-@njit(**FAST)
-def fill(values, index, pool):
-    """Copy dense values to the pool of the stored blocks."""
-    nx, ny, nz = values.shape
-    for a, b, c in np.ndindex(index.shape):
-        block = index[a, b, c]
-        if block >= 0:
-            i, j, k = a * SIDE, b * SIDE, c * SIDE
-            for p in range(min(SIDE, nx - i)):
-                for q in range(min(SIDE, ny - j)):
-                    for r in range(min(SIDE, nz - k)):
-                        pool[block, p, q, r] = values[i + p, j + q, k + r]
-
-
-@njit(**FAST)
-def unpack(field, out):
-    """Copy a field's values to a dense array."""
-    index, pool, _, far = field
-    nx, ny, nz = out.shape
-    for i in range(nx):
-        for j in range(ny):
-            for c in range(index.shape[2]):
-                block, k = index[i >> SHIFT, j >> SHIFT, c], c * SIDE
-                for r in range(min(SIDE, nz - k)):
-                    if block >= 0:
-                        out[i, j, k + r] = pool[block, i & WITHIN, j & WITHIN, r]
-                    else:
-                        out[i, j, k + r] = -far if block & 1 else far
-
-
 @njit(**FAST)
 def crossings(field, places, crossed):
     """Mark the blocks of both nodes of every change of sign between neighbours."""
@@ -97,17 +44,11 @@ def crossings(field, places, crossed):
         for i in range(a * SIDE, min(a * SIDE + SIDE, nx)):
             for j in range(b * SIDE, min(b * SIDE + SIDE, ny)):
                 for k in range(c * SIDE, min(c * SIDE + SIDE, nz)):
-                    p, q, r = i & WITHIN, j & WITHIN, k & WITHIN
-                    here = pool[n, p, q, r] < 0
-                    east = pool[n, p + 1, q, r] if p < WITHIN else value_at(field, min(i + 1, nx - 1), j, k)
-                    north = pool[n, p, q + 1, r] if q < WITHIN else value_at(field, i, min(j + 1, ny - 1), k)
-                    above = pool[n, p, q, r + 1] if r < WITHIN else value_at(field, i, j, min(k + 1, nz - 1))
-                    if i + 1 < nx and (east < 0) != here:
-                        crossed[a, b, c] = crossed[(i + 1) >> SHIFT, b, c] = True
-                    if j + 1 < ny and (north < 0) != here:
-                        crossed[a, b, c] = crossed[a, (j + 1) >> SHIFT, c] = True
-                    if k + 1 < nz and (above < 0) != here:
-                        crossed[a, b, c] = crossed[a, b, (k + 1) >> SHIFT] = True
+                    here = pool[n, i & WITHIN, j & WITHIN, k & WITHIN] < 0
+                    for axis in range(3):
+                        p, q, r = i + (axis == 0), j + (axis == 1), k + (axis == 2)
+                        if p < nx and q < ny and r < nz and (value_at(field, p, q, r) < 0) != here:
+                            crossed[a, b, c] = crossed[p >> SHIFT, q >> SHIFT, r >> SHIFT] = True
 
 
 @njit(**FAST)
@@ -127,16 +68,3 @@ def overlap(field, places, out):
                 for r in range(SIDE if p < SIDE and q < SIDE else 0, SIDE + 1):
                     at = value_at(field, min(i + p, nx - 1), min(j + q, ny - 1), min(k + r, nz - 1))
                     out[block, p, q, r] = at
-
-
-@njit(**FAST)
-def move(field, index, pool):
-    """Copy a field's values to the pool of another index."""
-    old = field[0]
-    for a, b, c in np.ndindex(index.shape):
-        block, there = index[a, b, c], old[a, b, c]
-        if block >= 0 and there >= 0:
-            for p, q, r in np.ndindex(SIDE, SIDE, SIDE):  # numba compiles an array's assignment seven times as long
-                pool[block, p, q, r] = field[1][there, p, q, r]
-        elif block >= 0:
-            pool[block] = -field[3] if there & 1 else field[3]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from reconstruct.sdf.block_kernels import crossings, fill, move, overlap, survey, unpack
+from reconstruct.sdf.block_kernels import crossings, overlap
 from reconstruct.sdf.kernels import SIDE
 
 
@@ -29,39 +29,38 @@ class Blocks(NamedTuple):
         return np.argwhere(self.layout >= 0).astype(np.int32, order="C")  # one layout: kernels are compiled once
 
     def dense(self) -> Float[np.ndarray, "nx ny nz"]:
-        """Return the values of all nodes, float32."""
-        out = np.empty(self.nodes, np.float32)
-        unpack(self, out)
-        return out
+        """Return the values of all nodes, of the pool's type."""
+        beyond = np.empty((2, SIDE, SIDE, SIDE), self.pool.dtype)
+        beyond[0], beyond[1] = self.far, -self.far
+        index = np.where(self.layout < 0, len(self.pool) + (self.layout & 1), self.layout)
+        blocks = np.concatenate([self.pool, beyond])[index].transpose(0, 3, 1, 4, 2, 5)
+        whole = blocks.reshape(SIDE * np.array(self.layout.shape))
+        return np.ascontiguousarray(whole[tuple(slice(n) for n in self.nodes)])
 
 
-def pack(values: Float[np.ndarray, "nx ny nz"], far: float | None = None) -> Blocks:
-    """Convert a dense array to blocks, without loss: blocks whose cells are all +far or all -far are not stored.
+def pack(values: Float[np.ndarray, "nx ny nz"]) -> Blocks:
+    """Convert a dense array (float32, voxels) to blocks, without loss.
 
-    Args:
-        values: float32, voxels.
-        far: by default the largest absolute value; no cell may have a larger one at all its nodes.
+    Blocks whose cells are all +far or all -far are not stored; far is the largest absolute value.
     """
-    far = float(np.abs(values).max()) if far is None else far
-    counts = [-(-n // SIDE) for n in values.shape]
-    stored, inside = np.empty(counts, np.bool_), np.empty(counts, np.bool_)
-    survey(values, far, stored, inside)
-    index = index_of(stored, inside)
-    pool = np.zeros((int(stored.sum()), SIDE, SIDE, SIDE), np.float32)
-    fill(values, index, pool)
-    return Blocks(index, pool, (values.shape[0], values.shape[1], values.shape[2]), far)
+    far = float(np.abs(values).max())
+    low, high = values, values  # of the cells of each block: the least and the largest
+    for axis, n in enumerate(values.shape):
+        spans = [slice(first, first + SIDE + 1) for first in range(0, n, SIDE)]
+        low = np.stack([np.moveaxis(low, axis, 0)[span].min(0) for span in spans], axis)
+        high = np.stack([np.moveaxis(high, axis, 0)[span].max(0) for span in spans], axis)
+    stored = (low < high) | (np.abs(low) < far)
+    padded = np.pad(values, [(0, -n % SIDE) for n in values.shape])
+    a, b, c = stored.shape
+    blocks = padded.reshape(a, SIDE, b, SIDE, c, SIDE).transpose(0, 2, 4, 1, 3, 5)
+    pool = np.ascontiguousarray(blocks[stored], np.float32)
+    return Blocks(index_of(stored, high < 0), pool, (values.shape[0], values.shape[1], values.shape[2]), far)
 
 
 def index_of(stored: Bool[np.ndarray, "bx by bz"], inside: Bool[np.ndarray, "bx by bz"]) -> Int[np.ndarray, "bx by bz"]:
-    """Number the stored blocks from 0; others get -(2 d + inside), with d the Chebyshev distance to a stored block."""
-    if stored.all():
-        away = np.zeros(stored.shape, np.int32)
-    elif stored.any():
-        away = np.asarray(ndimage.distance_transform_cdt(~stored, "chessboard"), np.int32)
-    else:
-        away = np.full(stored.shape, max(stored.shape), np.int32)
+    """Number the stored blocks from 0; of the others, those inside get -1 and those outside -2."""
     number = np.cumsum(stored, dtype=np.int32).reshape(stored.shape) - 1
-    return np.where(stored, number, -(2 * away + inside)).astype(np.int32)
+    return np.where(stored, number, np.where(inside, -1, -2)).astype(np.int32)
 
 
 def near_surface(field: Blocks, far: float) -> Blocks:
@@ -75,9 +74,9 @@ def near_surface(field: Blocks, far: float) -> Blocks:
     kept = field.layout >= 0
     inside[kept] = field.pool[:, 0, 0, 0] < 0
     index = index_of(touching(crossed), inside)
-    pool = np.empty((int(index.max(initial=-1)) + 1, SIDE, SIDE, SIDE), np.float32)
-    moved = field._replace(far=far)
-    move(moved, index, pool)
+    there = field.layout[index >= 0][:, None, None, None]
+    beyond = np.where(there & 1, np.float32(-far), np.float32(far))
+    pool = np.where(there < 0, beyond, field.pool[there[:, 0, 0, 0].clip(0)])
     return Blocks(index, pool, field.nodes, far)
 
 

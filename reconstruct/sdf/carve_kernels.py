@@ -2,10 +2,9 @@
 
 import math
 
-import numpy as np
 from numba import njit
 
-from reconstruct.sdf.kernels import FAST, INNER, UNCOUNTED
+from reconstruct.sdf.kernels import INNER, UNCOUNTED
 
 NEVER = -1e9
 CROSSING_STEPS = 12  # of a fixed point that contracts by slope * cot(elevation)
@@ -74,9 +73,21 @@ def above_ground(lit, points, lights, heights, origin, cell, top, skip, start, s
             lit[k, p] = 1 if free else 0
 
 
-@njit(**FAST)
-def carve(out, needed, denied, known, origin, spacing, lights, maps, field_origin, cell, ground, votes, start, stop):
-    """Compute each node's votes-th largest distance to the shadow cones of the lights; positive = proven empty.
+@njit(forceinline=True, **INNER)
+def _insert(best, value):
+    """Insert a value into the largest ones, if it is one of them."""
+    m = len(best) - 1
+    if value <= best[m]:
+        return
+    while m > 0 and best[m - 1] < value:
+        best[m] = best[m - 1]
+        m -= 1
+    best[m] = value
+
+
+@njit(**UNCOUNTED)
+def carve(out, needed, denied, known, origin, spacing, lights, maps, field_origin, cell, ground, best, start, stop):
+    """Compute each node's last of the largest distances to the shadow cones of the lights; positive = proven empty.
 
     Where it is more than SURELY_EMPTY nodes, it is a smaller one that is as sure, and the count of `needed` ends early.
 
@@ -91,27 +102,9 @@ def carve(out, needed, denied, known, origin, spacing, lights, maps, field_origi
         maps: fields, (lights, gx, gy) signed distance inside lit ground, world length, at field_origin + cell * (i, j);
             dark, the same of ground seen in shadow; heights, (gx, gy) of uneven ground there, empty for a plane.
         ground: height of the ground plane.
+        best: of use here only, with room for as many distances as are compared.
     """
-    field = (*maps, field_origin, cell)
-    _carve(out, needed, denied, known, origin, spacing, lights, field, ground, np.empty(votes), start, stop)
-
-
-@njit(forceinline=True, **INNER)
-def _insert(best, value):
-    """Insert a value into the largest ones, if it is one of them."""
-    m = len(best) - 1
-    if value <= best[m]:
-        return
-    while m > 0 and best[m - 1] < value:
-        best[m] = best[m - 1]
-        m -= 1
-    best[m] = value
-
-
-@njit(**INNER)
-def _carve(out, needed, denied, known, origin, spacing, lights, field, ground, best, start, stop):
-    """Do the work of carve; `best` holds the largest distances of a node."""
-    fields, dark, heights, field_origin, cell = field
+    fields, dark, heights = maps
     votes, enough = len(best), SURELY_EMPTY * spacing
     _, ny, nz = out.shape
     for i in range(start, stop):

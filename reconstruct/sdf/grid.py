@@ -74,8 +74,13 @@ class SdfGrid:
 
     @cached_property
     def ball(self) -> Ball:
-        """A ball that contains the object, to skip rays that miss it; made once."""
-        return ball_around(self.values, self.origin, self.spacing)
+        """A ball that contains every point at which the surface absorbs light from a ray; made once."""
+        nodes = torch.nonzero(self.values < self.spacing).float()  # the surface lies between two such nodes
+        if not len(nodes):
+            return Ball(self.origin, -torch.inf)
+        middle = (nodes.amax(0) + nodes.amin(0)) / 2
+        radius = float((nodes - middle).norm(dim=-1).max())
+        return Ball(self.origin + self.spacing * middle, self.spacing * (radius + REACH_VOXELS))
 
     def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """Return the trilinear SDF at world points; outside the box, the nearest value plus the distance to the box."""
@@ -90,28 +95,9 @@ class SdfGrid:
 
     def gradient(self, points: Float[Tensor, "n 3"], step: float = 0.5) -> Float[Tensor, "n 3"]:
         """Return the gradient at world points: central differences over step spacings each way; not normalised."""
-        tensors = (points, self.values)
-        if all(x.device.type == "cpu" and x.dtype == torch.float32 and not x.requires_grad for x in tensors):
-            places, out = (points.double() - self.origin.double()) / self.spacing, torch.empty_like(points)
-            gradients(self.blocks, np.ascontiguousarray(places.numpy()), step, out.numpy(), 0, len(points))
-            return out
-        offsets = step * self.spacing * torch.eye(3, dtype=points.dtype, device=points.device)
-        differences = [self.sdf(points + offset) - self.sdf(points - offset) for offset in offsets]
-        return torch.stack(differences, -1) / (2 * step * self.spacing)
-
-    def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
-        """Return no features, see reconstruct.shadowneus.field.SdfField."""
-        return points.new_zeros(len(points), 0)
+        places, out = (points.double() - self.origin.double()) / self.spacing, torch.empty_like(points)
+        gradients(self.blocks, np.ascontiguousarray(places.numpy()), step, out.numpy(), 0, len(points))
+        return out
 
     def _last(self) -> Float[Tensor, "3"]:
         return torch.tensor(self.values.shape, dtype=self.values.dtype, device=self.values.device) - 1
-
-
-def ball_around(values: Float[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], spacing: float) -> Ball:
-    """Return a ball that contains every point at which the surface of an SdfGrid absorbs light from a ray."""
-    nodes = torch.nonzero(values < spacing).float()  # its surface lies between two such nodes
-    if not len(nodes):
-        return Ball(origin, -torch.inf)
-    middle = (nodes.amax(0) + nodes.amin(0)) / 2
-    radius = float((nodes - middle).norm(dim=-1).max())
-    return Ball(origin + spacing * middle, spacing * (radius + REACH_VOXELS))

@@ -11,7 +11,7 @@ not.
 
 The argument `phi` is always the tuple of reconstruct/sdf/blocks.py, with overlapping blocks: an index of blocks of
 SIDE^3 cells, a pool with the nodes of blocks near the surface, the grid's numbers of nodes, and |SDF| in blocks that
-are not stored. Rays skip those. Gradients do not overlap: SIDE^3 nodes per block are used.
+are not stored. Gradients do not overlap: SIDE^3 nodes per block are used.
 
 UNCOUNTED functions do without numba's counts of references to arrays, at which cores wait for each other. They cannot
 make arrays, nor call methods of arrays that do, as max(). INNER functions are called by other kernels alone: no entry
@@ -59,33 +59,18 @@ def _cell(nodes, x, y, z):
 
 
 @njit(forceinline=True, **INNER)
-def _beyond(block, far):
-    """Return the SDF in a block that is not stored: odd numbers are inside."""
-    return -far if block & 1 else far
-
-
-@njit(forceinline=True, **INNER)
 def _sample(phi, x, y, z):
     index, pool, nodes, far = phi
     i, j, k, u, v, w = _cell(nodes, x, y, z)
     block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
     if block < 0:
-        return _beyond(block, far)
+        return -far if block & 1 else far
     p, q, r = i & WITHIN, j & WITHIN, k & WITHIN
     a = pool[block, p, q, r] * (1 - w) + pool[block, p, q, r + 1] * w
     b = pool[block, p, q + 1, r] * (1 - w) + pool[block, p, q + 1, r + 1] * w
     c = pool[block, p + 1, q, r] * (1 - w) + pool[block, p + 1, q, r + 1] * w
     d = pool[block, p + 1, q + 1, r] * (1 - w) + pool[block, p + 1, q + 1, r + 1] * w
     return (a * (1 - v) + b * v) * (1 - u) + (c * (1 - v) + d * v) * u
-
-
-@njit(forceinline=True, **INNER)
-def _free(phi, x, y, z):
-    """Return the distance that a point can move in any direction without reaching a stored block; 0 in one."""
-    index, _, nodes, _ = phi
-    i, j, k, _, _, _ = _cell(nodes, x, y, z)
-    block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
-    return SIDE * ((-block >> 1) - 1.0) if block < 0 else 0.0
 
 
 @njit(forceinline=True, **INNER)
@@ -206,10 +191,6 @@ def _extrema(phi, ox, oy, oz, dx, dy, dz, near, far, s, jitter, lows, highs):
         if first:
             step *= jitter
             first = False
-        elif size >= phi[3]:  # the SDF is constant there: the same steps, without sampling it
-            leap = min(tb + _free(phi, ox + tb * dx, oy + tb * dy, oz + tb * dz), far)
-            while tb + step < leap:
-                tb += step
         tc = min(tb + step, far)
         fc = _sample(phi, ox + tc * dx, oy + tc * dy, oz + tc * dz)
         if fc < fb:
@@ -269,11 +250,6 @@ def _first_surface(phi, ox, oy, oz, dx, dy, dz, near, far, width):
             return cross, part_t, part_f
         if tb >= far:
             break
-        if fb >= phi[3]:  # the SDF is constant there: the same steps, without sampling it
-            leap = min(tb + _free(phi, ox + tb * dx, oy + tb * dy, oz + tb * dz), far)
-            while tb + _stride(fb, 0.5 * width * tb) < leap:
-                tb += _stride(fb, 0.5 * width * tb)
-            half = 0.5 * width * tb
         tc = min(tb + _stride(fb, half), far)
         fc = _sample(phi, ox + tc * dx, oy + tc * dy, oz + tc * dz)
         if fb >= 0 and fc < 0:
@@ -336,25 +312,6 @@ def first_surfaces(phi, origins, directions, far, width, hit, part_t, part_f, st
         x, y, z = origins[r, 0], origins[r, 1], origins[r, 2]
         dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
         hit[r], part_t[r], part_f[r] = _first_surface(phi, x, y, z, dx, dy, dz, 0.0, far[r], width)
-
-
-@njit(forceinline=True, **INNER)
-def hash_uniform(seed, a, b):
-    """Return a uniform number in [0, 1) from three integers (splitmix64); without state, so any step is repeatable."""
-    x = np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(a) * np.uint64(0xBF58476D1CE4E5B9)
-    x = x + np.uint64(b) * np.uint64(0x94D049BB133111EB)
-    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    x = x ^ (x >> np.uint64(31))
-    return np.float64(x >> np.uint64(11)) * (1.0 / 9007199254740992.0)
-
-
-@njit(**UNCOUNTED)
-def uniforms(seed, a, step, out, start, stop):
-    """Fill rows start .. stop - 1 of out with uniform numbers from (seed, a, step * row + column)."""
-    for r in range(start, stop):
-        for c in range(out.shape[1]):
-            out[r, c] = hash_uniform(seed, a, step * r + c)
 
 
 EDGE, GROUND, OBJECT = 0, 1, 2  # content of a pixel: both or unknown, surely ground, surely object

@@ -10,9 +10,8 @@ from scipy import ndimage
 
 from calibration.pose import Pose
 from reconstruct.sdf import level_set_kernels as levelset
-from reconstruct.sdf.blocks import Blocks, index_of, near_surface, pack, touching
+from reconstruct.sdf.blocks import Blocks, near_surface, pack
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.kernels import SIDE
 from reconstruct.sdf.rays import run, thread_count
 
 MARGIN = 3.0  # voxels of empty space about the surface
@@ -23,7 +22,6 @@ STABLE_BENDING = 1 / 80  # explicit steps of the biharmonic flow are stable belo
 BAND = 6.0  # voxels about the surface in which the SDF is kept and may move
 WHOLE = BAND - 1e-3  # voxels: a node at the band itself does not move
 SAME = 1e-3  # voxels: a box whose size is a whole number of them but for rounding
-BLOCKS_AT_ONCE = 4096  # of a resampling: 100 MB of points
 
 
 def carried(grid: SdfGrid, frame_from_grid: Pose) -> SdfGrid:
@@ -194,14 +192,13 @@ class LevelSet:
 
 def active_nodes(field: Blocks) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, "n 6"]]:
     """Return flat pool indices of the nodes within BAND, except on faces of the box, and of their six neighbours."""
-    places = field.places()
-    counts = np.zeros(len(places), np.int64)
-    run(levelset.count_active, len(places), field, places, WHOLE, counts)
-    ends = np.cumsum(counts)
-    total = int(ends[-1]) if len(ends) else 0
-    active, around = np.empty(total, np.int32), np.empty((total, 6), np.int32)
-    run(levelset.list_active, len(places), field, places, WHOLE, ends - counts, active, around)
-    return active, around
+    moves = np.abs(field.dense()) < WHOLE
+    for axis in range(3):
+        np.moveaxis(moves, axis, 0)[[0, -1]] = False
+    number = np.arange(field.pool.size, dtype=np.int32).reshape(field.pool.shape)
+    places, at = field._replace(pool=number, far=0).dense().ravel(), np.flatnonzero(moves)
+    _, ny, nz = field.nodes
+    return places[at], places[at[:, None] + np.array([-1, 1, -nz, nz, -ny * nz, ny * nz])]
 
 
 def redistanced(field: Blocks) -> Blocks:
@@ -224,31 +221,9 @@ def resampled(grid: SdfGrid, nodes: int) -> LevelSet:
     lower, upper = grid.origin.double().numpy(), grid.upper().double().numpy()
     spacing = float((upper - lower).max() / (nodes - 1))
     shape = [int(n) + 1 for n in np.ceil((upper - lower) / spacing - SAME)]  # never smaller: the object must fit in
-    index = _near_blocks(grid.values.numpy() < 0, shape, spacing / grid.spacing)
-    pool = np.zeros((int(index.max(initial=-1)) + 1, SIDE, SIDE, SIDE), np.float32)
-    places, within = np.argwhere(index >= 0), np.indices((SIDE,) * 3).reshape(3, -1).T
-    for part in np.split(np.arange(len(places)), range(BLOCKS_AT_ONCE, len(places), BLOCKS_AT_ONCE)):
-        at = (places[part, None] * SIDE + within).reshape(-1, 3)
-        points = torch.from_numpy(at).float() * spacing + torch.from_numpy(lower).float()
-        pool[part] = (grid.sdf(points).numpy() / spacing).reshape(-1, SIDE, SIDE, SIDE)
-    return LevelSet(Blocks(index, pool, (shape[0], shape[1], shape[2]), BAND), lower, spacing)
-
-
-def _near_blocks(inside: np.ndarray, shape: list[int], ratio: float) -> Int[np.ndarray, "bx by bz"]:
-    """Return the index, see `index_of`, of the blocks of a finer grid about those that a coarse surface may cross.
-
-    A block and the nodes beside it lie in cells of the coarse grid; the surface crosses none of these cells if their
-    corners are all inside or all outside.
-
-    Args:
-        ratio: spacing of the finer grid over that of the coarse one.
-    """
-    every = some = inside
-    for axis, n in enumerate(shape):
-        starts = np.arange(0, n, SIDE)
-        low = np.floor((starts - 1) * ratio).astype(int).clip(0)
-        high = np.ceil((starts + SIDE) * ratio).astype(int) + 1
-        spans = [slice(a, max(b, a + 1)) for a, b in zip(low, high, strict=True)]
-        every = np.stack([np.moveaxis(every, axis, 0)[span].all(0) for span in spans], axis)
-        some = np.stack([np.moveaxis(some, axis, 0)[span].any(0) for span in spans], axis)
-    return index_of(touching(some & ~every), every)
+    phi = np.empty(shape, np.float32)
+    y, z = (torch.from_numpy(own.ravel()) for own in np.indices(shape[1:]))
+    for x, layer in enumerate(phi):  # a fine grid has 14 million nodes
+        points = torch.stack([torch.full_like(y, x), y, z], 1).float() * spacing + torch.from_numpy(lower).float()
+        layer[...] = (grid.sdf(points).numpy() / spacing).reshape(layer.shape)
+    return LevelSet(phi, lower, spacing)

@@ -1,8 +1,4 @@
-"""Kernels of the level set: the nodes that move, and redistancing. Numba, voxels, on Blocks.
-
-Pools are those of reconstruct/sdf/blocks.py. `active` are flat pool indices of the nodes that move; `around` are those
-of their six neighbours along z, y, x, before and after.
-"""
+"""Redistancing of a level set. Numba, voxels, on Blocks; pools are those of reconstruct/sdf/blocks.py."""
 
 import math
 
@@ -14,56 +10,6 @@ from reconstruct.sdf.kernels import FAST, INNER, SHIFT, SIDE, WITHIN
 
 LEAST_STEP = 0.57  # voxels: a node's distance exceeds its nearest neighbour's by at least 1 / sqrt(3)
 BESIDE = 2.5  # voxels: beyond this a node has no neighbour on the other side
-
-
-# --- the nodes that move ---------------------------------------------------------------------------------------------
-
-
-@njit(forceinline=True, **INNER)
-def _moves(field, band, block, i, j, k):
-    """Return whether a node of a stored block is within the band and not on a face of the box."""
-    nx, ny, nz = field[2]
-    if not (0 < i < nx - 1 and 0 < j < ny - 1 and 0 < k < nz - 1):
-        return False
-    return abs(field[1][block, i & WITHIN, j & WITHIN, k & WITHIN]) < band
-
-
-@njit(**FAST)
-def count_active(field, places, band, counts, start, stop):
-    """Count the nodes of each block that are within the band and not on a face of the box."""
-    for block in range(start, stop):
-        i, j, k = places[block, 0] * SIDE, places[block, 1] * SIDE, places[block, 2] * SIDE
-        counts[block] = 0
-        for p, q, r in np.ndindex(SIDE, SIDE, SIDE):
-            counts[block] += _moves(field, band, block, i + p, j + q, k + r)
-
-
-@njit(forceinline=True, **INNER)
-def _place(index, i, j, k):
-    """Return the index of a stored block's node in the flattened pool."""
-    block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
-    return ((block * SIDE + (i & WITHIN)) * SIDE + (j & WITHIN)) * SIDE + (k & WITHIN)
-
-
-@njit(**FAST)
-def list_active(field, places, band, first, active, around, start, stop):
-    """List the nodes of count_active and their neighbours; a block's list begins at first[block]."""
-    index = field[0]
-    for block in range(start, stop):
-        i, j, k = places[block, 0] * SIDE, places[block, 1] * SIDE, places[block, 2] * SIDE
-        n = first[block]
-        for p in range(i, i + SIDE):
-            for q in range(j, j + SIDE):
-                for r in range(k, k + SIDE):
-                    if _moves(field, band, block, p, q, r):
-                        active[n] = _place(index, p, q, r)
-                        around[n, 0], around[n, 1] = _place(index, p, q, r - 1), _place(index, p, q, r + 1)
-                        around[n, 2], around[n, 3] = _place(index, p, q - 1, r), _place(index, p, q + 1, r)
-                        around[n, 4], around[n, 5] = _place(index, p - 1, q, r), _place(index, p + 1, q, r)
-                        n += 1
-
-
-# --- redistancing ----------------------------------------------------------------------------------------------------
 
 
 @njit(**FAST)

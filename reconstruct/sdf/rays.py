@@ -152,10 +152,11 @@ def visibility(
         lights: one per point, homogeneous, world.
         sharpness: NeuS s in 1 / world length.
     """
-    phi, out = grid.blocks, np.empty(len(points))
-    start, towards = to_grid(grid, points), lights_to_grid(grid, lights)
-    per_voxel = sharpness * grid.spacing
-    run(kernels.transmittances, len(out), phi, start, towards, per_voxel, out)
+    out = np.empty(len(points))
+    for first in range(0, len(out), RAYS_PER_BATCH):
+        some = slice(first, first + RAYS_PER_BATCH)
+        ends, part = (to_grid(grid, points[some]), lights_to_grid(grid, lights[some])), out[some]
+        run(kernels.transmittances, len(part), grid.blocks, *ends, sharpness * grid.spacing, part)
     return torch.from_numpy(out).float()
 
 
@@ -174,14 +175,6 @@ def shadow_starts(
 def unshadowed(
     grid: SdfGrid, starts: Float[Tensor, "n 3"], lights: Float[Tensor, "lights 4"]
 ) -> Float[Tensor, "lights n"]:
-    """Return the share of each homogeneous world light that reaches each point, in [0, 1]; rays run in batches."""
-    out = torch.empty(len(lights), len(starts))
-    together = max(1, RAYS_PER_BATCH // max(1, len(starts)))
-    for first in range(0, len(lights), together):
-        some = lights[first : first + together]
-        for block in range(0, len(starts), RAYS_PER_BATCH):
-            part = starts[block : block + RAYS_PER_BATCH]
-            rays = part.repeat(len(some), 1), some.repeat_interleave(len(part), 0)
-            seen = visibility(grid, *rays, SHARPNESS_PER_VOXEL / grid.spacing)
-            out[first : first + together, block : block + RAYS_PER_BATCH] = seen.reshape(len(some), len(part))
-    return out
+    """Return the share of each homogeneous world light that reaches each point, in [0, 1]."""
+    s = SHARPNESS_PER_VOXEL / grid.spacing
+    return torch.stack([visibility(grid, starts, light.expand(len(starts), 4), s) for light in lights])

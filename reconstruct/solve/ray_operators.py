@@ -17,7 +17,7 @@ from reconstruct.scene import Scene, lights_in_frame
 from reconstruct.sdf import kernels
 from reconstruct.sdf.kernels import FAR, GRAZING, GROUND, JITTER, MASK_JITTER, MAX_START, NEVER, NO_WEIGHT, OBJECT
 from reconstruct.sdf.level_set import LevelSet
-from reconstruct.sdf.rays import first_surfaces, run
+from reconstruct.sdf.rays import first_surfaces
 from reconstruct.torch_sdf.equations import area_ratio, cross_entropy, moved_intersection
 from reconstruct.torch_sdf.march import central_differences
 from reconstruct.torch_sdf.ray_field import RayField, ray_field
@@ -191,10 +191,13 @@ class RayOperators:
         return start, away
 
     def _uniforms(self, iteration: int, turn: int, count: int, columns: int, step: int) -> Float[Tensor, "count c"]:
-        """Return random shares of a first step, from a half to all of it."""
-        numbers = np.empty((count, columns))
-        run(kernels.uniforms, count, self.config.seed, iteration * kernels.TURNS + turn, step, numbers)
-        return self._moved(0.5 + 0.5 * numbers)
+        """Return random shares of a first step, from a half to all of it; splitmix64: any step is repeatable."""
+        seed = self.config.seed * 0x9E3779B97F4A7C15 + (iteration * kernels.TURNS + turn) * 0xBF58476D1CE4E5B9
+        places = (step * np.arange(count)[:, None] + np.arange(columns)).astype(np.uint64)
+        x = np.uint64(seed % 2**64) + places * np.uint64(0x94D049BB133111EB)
+        for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB), (31, 1)):
+            x = (x ^ (x >> np.uint64(shift))) * np.uint64(factor)
+        return self._moved(0.5 + 0.5 * (x >> np.uint64(11)) * 2.0**-53)
 
     def _moved(self, values: np.ndarray | Tensor) -> Tensor:
         """Move values to the device; floating-point values are converted to the type of positions along rays."""

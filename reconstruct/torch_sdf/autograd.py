@@ -21,7 +21,7 @@ from torch.nn.functional import logsigmoid
 from reconstruct.scene import lights_in_frame
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.kernels import FAR
-from reconstruct.torch_sdf.march import Volume, central_differences
+from reconstruct.torch_sdf.march import Volume
 from reconstruct.torch_sdf.rays import BATCHES, Extrema, extrema, towards
 
 LARGEST = 2.0**16  # bound of one amount that is rounded to a quantum: 2^9 of them on a node sum exactly in float64
@@ -85,10 +85,6 @@ class DifferentiableSdf:
             sizes: its gradient receives the absolute value of each sample's gradient.
         """
         return Sample.apply(self.values, self.evidence, points, sizes, self.volume, self.quantum)
-
-    def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Return central differences over one voxel, differentiable with respect to values; not normalised."""
-        return central_differences(self.sample, points)
 
 
 @dataclass(frozen=True)
