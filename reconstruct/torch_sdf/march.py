@@ -5,6 +5,7 @@ Grid frame, voxels.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -91,32 +92,47 @@ def central_differences(
     return (ahead - behind) / (2 * step)
 
 
-def marched(
-    volume: Volume,
-    origins: Float[Tensor, "n 3"],
-    directions: Float[Tensor, "n 3"],
-    near: Float[Tensor, " n"],
-    end: Float[Tensor, " n"],
-    margin: float,
-    jitter: Float[Tensor, " n"] | float,
-) -> tuple[Float[Tensor, "samples n"], Float[Tensor, "samples n"]]:
-    """Return parameter and SDF of every sample of rays; after a ray's end its last sample is repeated.
+class State(NamedTuple):
+    """Rays under way."""
 
-    A ray goes by 0.95 (|SDF| - margin) voxels from a sample, at least STEP; by a share `jitter` of it from the first.
-    """
-    times, values = [near[None]], [volume.sample(origins + near[:, None] * directions)[None]]
-    alive, share = torch.arange(len(near), device=near.device), jitter
-    while len(alive):
-        o, d, last, t, f = (x[alive] for x in (origins, directions, end, times[-1][-1], values[-1][-1]))
-        block = []
-        for _ in range(BLOCK):
+    origins: Float[Tensor, "n 3"]
+    directions: Float[Tensor, "n 3"]
+    end: Float[Tensor, " n"]
+    t: Float[Tensor, " n"]  # of the last sample
+    f: Float[Tensor, " n"]
+    factor: Float[Tensor, " n"]  # of the next step
+
+    def block(self, volume: Volume, margin: float) -> tuple[Float[Tensor, "samples n"], Float[Tensor, "samples n"]]:
+        """Return parameter and SDF of the next samples; at a ray's end its last one is repeated.
+
+        A ray goes by 0.95 (|SDF| - margin) voxels from a sample, at least STEP.
+        """
+        t, f, times, values = self.t, self.f, [], []
+        for number in range(BLOCK):
             step = (0.95 * (f.abs() - margin)).clamp(min=STEP)
-            t, share = torch.minimum(t + share * step, last), 1.0
-            f = volume.sample(torch.addcmul(o, t[:, None], d))
-            block.append((t, f))
-        for rows, some in zip((times, values), zip(*block, strict=True), strict=True):
-            whole = rows[-1][-1].expand(BLOCK, -1).clone()
-            whole[:, alive] = torch.stack(some)
-            rows.append(whole)
-        alive = alive[t < last]
+            t = torch.minimum(t + (self.factor * step if number == 0 else step), self.end)
+            f = volume.sample(torch.addcmul(self.origins, t[:, None], self.directions))
+            times.append(t)
+            values.append(f)
+        return torch.stack(times), torch.stack(values)
+
+
+def marched(
+    volume: Volume, rays: State, margin: float
+) -> tuple[Float[Tensor, "samples n"], Float[Tensor, "samples n"]]:
+    """Return parameter and SDF of every sample after the first; after a ray's end its last sample is repeated."""
+    alive, rows = torch.arange(len(rays.t), device=rays.t.device), [(rays.t[None], rays.f[None])]
+    while len(alive):
+        block = rays.block(volume, margin)
+        whole = tuple(row[-1].expand(BLOCK, -1).clone() for row in rows[-1])
+        for all_rays, some in zip(whole, block, strict=True):
+            all_rays[:, alive] = some
+        rows.append((whole[0], whole[1]))
+        t, f = block[0][-1], block[1][-1]
+        goes_on = (t < rays.end).nonzero()[:, 0]
+        alive = alive[goes_on]
+        rays = State(
+            *(x[goes_on] for x in (rays.origins, rays.directions, rays.end, t, f)), torch.ones_like(t[goes_on])
+        )
+    times, values = zip(*rows, strict=True)
     return torch.cat(times), torch.cat(values)
