@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from reconstruct.sdf.kernels import DARK, MAX_MINIMA, REFRACTORY
-from reconstruct.torch_sdf.march import State, Volume, marched
+from reconstruct.torch_sdf.march import State, Volume, forget_blocks, marched
 
 MISSED = 1e9  # the parameter of a ray that meets nothing
 MOST_RAYS = 2**17  # at once; on 240 nodes 1.2 GiB for camera rays, 0.4 GiB for shadow rays
@@ -34,6 +34,7 @@ class Batches:
         if self.rays <= FEWEST_RAYS:
             return False
         self.rays //= 2
+        forget_blocks()
         return True
 
 
@@ -102,7 +103,7 @@ def extrema(
     first = jitter[crossing] if isinstance(jitter, Tensor) else torch.full_like(near, jitter)
     state = State(o, d, end, near, volume.sample(o + near[:, None] * d), first)
     # After a ray's end its last sample is repeated, once at least.
-    times, values = (torch.cat([x, x[-1:]]) for x in marched(volume, state, band))
+    times, values = (torch.cat([x, x[-1:]]) for x in marched(volume, state, near.new_full((), band)))
     found = _extrema_of(volume, (o, d), end, sharpness, times, values)
     full = []
     for part, blank in zip(found, (0, 0, 0, 0, 0, 0, MISSED), strict=True):
