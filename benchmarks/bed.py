@@ -118,7 +118,7 @@ def scored(out: Path, capture: Path, code: int, said: str, factors: dict[str, st
         numbers = evaluate(out, capture, samples=100)
         extent = max(trimesh.load_mesh(capture / "gt" / "object.ply", process=False).extents)
         row |= {"lights_pct": numbers.get("light_median_pct"), "iou": numbers["mask_iou"]}
-        row |= {"depth_pct": float(100 * numbers["depth_mae_mm"] / extent), "normals_deg": numbers["normal_mae_deg"]}
+        row |= {"depth_pct": float(100 * numbers["depth_mae"] / extent), "normals_deg": numbers["normal_mae_deg"]}
         row["bad_used"] = len(numbers["bad_photos_used"])
     return row | judged(row, factors)
 

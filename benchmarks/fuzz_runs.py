@@ -279,7 +279,7 @@ def warm_up(work: Path) -> None:
 def lighten() -> None:
     """Small pictures and few samples: what a command computes from a run that was read is not what is tried here."""
     viewer.report.document.OVERSAMPLING = 1
-    reconstruct.evaluate.metrics.SCENE_SAMPLES = reconstruct.evaluate.metrics.CAPTURE_SAMPLES = FEW_SAMPLES
+    reconstruct.evaluate.metrics.SAMPLES = FEW_SAMPLES
     facing_reflectances()  # a table that every process would make for itself
 
 

@@ -15,14 +15,14 @@ from pathlib import Path
 from one_run import SPOT, own_and_passed_on, run
 from sheet import Sheet, parser_of
 
-MEASURES = {  # what a table shows, by the names that `evaluate` has for it: of captures, of scenes
-    "lights, %": ("light_median_pct",),
-    "depth": ("depth_mae_mm", "depth_l1_raw"),
-    "normals, deg": ("normal_mae_deg",),
-    "IoU": ("mask_iou",),
-    "F": ("fscore_2pct", "fscore"),
-    "hidden": ("hidden_recall",),
-    "bad photos used": ("bad_photos_used",),
+MEASURES = {  # what a table shows, by the names that `evaluate` has for it
+    "lights, %": "light_median_pct",
+    "depth": "depth_mae",
+    "normals, deg": "normal_mae_deg",
+    "IoU": "mask_iou",
+    "F": "fscore",
+    "hidden": "hidden_recall",
+    "bad photos used": "bad_photos_used",
 }
 STAGES = ("capture", "calibrate", "solve", "mesh", "detail")
 
@@ -33,8 +33,7 @@ def rows(parsed: argparse.Namespace, options: list[str]) -> Iterator[dict]:
         for preset in parsed.presets:
             found = run(capture, parsed.out / preset, ["--preset", preset, *options])
             row = {"capture": found["capture"], "preset": preset} | ({"exit": found["exit"]} if found["exit"] else {})
-            for name, keys in MEASURES.items():
-                row[name] = next((found[key] for key in keys if key in found), None)
+            row |= {name: found.get(key) for name, key in MEASURES.items()}
             if not found["exit"]:
                 report = json.loads((parsed.out / preset / found["capture"] / "report.json").read_text())["stages"]
                 row |= {f"{name}, CPU s": report[name]["cpu_seconds"] for name in STAGES if name in report}

@@ -149,7 +149,7 @@ def main() -> None:
     parts.append(table([row for row, _ in solves]))
     if len(solves) > 1:
         reference = as_truth(solves[1][1], subject.calibration)
-        apart = shown(compare_views(reference, seen(solves[0][1], reference), None))
+        apart = shown(compare_views(reference, seen(solves[0][1], reference)))
         parts.append(["How far apart the two solves are:", "", *table([{"": against} | apart])])
     same = torch.equal(again.grid.values, solves[0][1].grid.values)
     sheet.write(levels, *parts, [f"A second solve by torch ends in {'the same' if same else 'other'} bits."])

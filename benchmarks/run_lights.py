@@ -77,7 +77,8 @@ def capture(named: str, way: str) -> dict:
     truth = load_capture_truth(Path(place), calibration.camera.width, calibration.camera.height)
     given = json.loads((Path(place) / "gt" / "lights.json").read_text())["photos"]
     true_lights = {Path(light["file"]).name: light for light in given}
-    centre = calibration.world_from_camera.apply(truth.centre())
+    world_from_board = calibration.world_from_camera @ truth.posed_camera.world_from_camera.inverse()
+    centre = world_from_board.apply(truth.centre())
     errors, inside, turns, dropped, kept = [], [], [], 0, 0
     for light in calibration.lights:
         true = true_lights[light.photo]
@@ -85,7 +86,7 @@ def capture(named: str, way: str) -> dict:
             dropped += true["usable"] and not light.used
             kept += light.used and not true["usable"]
             continue
-        expected = calibration.world_from_camera.apply(truth.camera_from_board.apply(np.array(true["position_mm"])))
+        expected = world_from_board.apply(np.array(true["position_mm"]))
         off = np.array(light.position) - expected
         errors.append(100 * np.linalg.norm(off) / np.linalg.norm(expected - centre))
         inside.append(np.abs(off) < 1.96 * light.sigma)

@@ -24,7 +24,7 @@ from solves import SYNTHETIC, open_subject, outcome, parsed, solve_parser, with_
 
 from calibration.scenes.deepshadow import LIGHTS, PARAMETERS, PICTURES
 from capture.photos.photo import read_grey
-from reconstruct.evaluate.surface_distance import angle_deg, nmze
+from reconstruct.evaluate.surface_distance import angle_deg
 from reconstruct.run.presets import preset
 from reconstruct.source.photos import keep_spread
 
@@ -38,6 +38,12 @@ PRINTED = {  # nMZE [tab:deepshadow_nmze], normal error, degrees [tab:deepshadow
     "relief": ((0.1427, 0.1424), (22.13, 19.19)),
 }
 CHAIR = {3: 28.03, 5: 10.52, 10: 8.88, 20: 7.59, 50: 7.01}  # normal error, degrees, by photos [tab:eval_number]
+
+
+def nmze(depth: np.ndarray, truth: np.ndarray) -> float:
+    """Mean difference of two depth maps, each first scaled to 0..1 by its own range [DeepShadow's nMZE]."""
+    scaled = [(z - z.min()) / max(np.ptp(z), 1e-12) for z in (depth, truth)]
+    return float(np.abs(scaled[0] - scaled[1]).mean())
 
 
 def score(out: Path, scene: Path) -> tuple[float, float]:

@@ -113,7 +113,7 @@ def measured(capture: Path, run: Path, pairs: int) -> Measured:
 def _turn(capture: Path, found: Calibration) -> Float[np.ndarray, "4 4"]:
     """From the found world to the true one: nothing, or half a turn about the middle of a plain checkerboard."""
     truth = load_capture_truth(capture, found.camera.width, found.camera.height)
-    between = truth.camera_from_board.inverse().rotate(found.world_from_camera.inverse().rotate(np.eye(3)))
+    between = truth.posed_camera.world_from_camera.rotate(found.world_from_camera.inverse().rotate(np.eye(3)))
     turn = np.eye(4)
     if between[0, 0] < 0:
         known = json.loads((capture / "gt" / "board.json").read_text())

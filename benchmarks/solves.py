@@ -10,14 +10,13 @@ import argparse
 import dataclasses
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-import trimesh
 from sheet import parser_of
 from synthetic import HEAP, Look, render  # pyright: ignore[reportMissingImports]  # of the tests
 
@@ -39,12 +38,12 @@ from reconstruct.source.source import RunOptions, open_source
 SAMPLES = 20_000  # points on each surface: the F-score repeats to 0.003
 SYNTHETIC = "synthetic"
 LOOK = Look(width=200, height=150, n_lights=40, noise=0.003, texture=0.2, with_shadow=True, with_mask=True)
-MEASURES = {  # by the names of a capture's measure, of a scene's
-    "depth": ("depth_mae_mm", "depth_l1_raw"),
-    "normals, deg": ("normal_mae_deg", "normal_mae_deg"),
-    "mask IoU": ("mask_iou", "mask_iou"),
-    "F": ("fscore_2pct", "fscore"),
-    "hidden recall": ("hidden_recall", "hidden_recall"),
+MEASURES = {  # by the names that `evaluate` has for them
+    "depth": "depth_mae",
+    "normals, deg": "normal_mae_deg",
+    "mask IoU": "mask_iou",
+    "F": "fscore",
+    "hidden recall": "hidden_recall",
 }
 
 
@@ -128,7 +127,7 @@ def of_maps(
     seen_depth = np.where(mask, depth.ravel(), np.inf).astype(float)
     turned = normals.reshape(-1, 3).astype(float)
     posed_camera = dataclasses.replace(calibration.posed_camera, ground_height=ground_height)
-    return Reference(posed_camera, seen_depth, turned, mask, trimesh.Trimesh())
+    return Reference(posed_camera, seen_depth, turned, mask)
 
 
 def scene_of(subject: Subject, calibration: Calibration, long_side: int) -> Scene:
@@ -164,7 +163,7 @@ def as_truth(solved: SolvedScene, calibration: Calibration) -> Reference:
 def score(solved: SolvedScene, subject: Subject) -> dict:
     """Every measure of a solved scene by its name."""
     if subject.truth is not None:
-        return compare_views(subject.truth, seen(solved, subject.truth), None)
+        return compare_views(subject.truth, seen(solved, subject.truth))
     assert subject.folder is not None
     with tempfile.TemporaryDirectory() as folder:
         leave(solved, subject.calibration, Path(folder))
@@ -192,21 +191,15 @@ def leave(solved: SolvedScene, calibration: Calibration, out: Path) -> None:
     cv2.imwrite(str(out / "mask.png"), np.where(mask, 255, 0).astype(np.uint8))
 
 
-def shown(numbers: dict, measures: Mapping[str, tuple[str, str]] = MEASURES) -> dict[str, float | None]:
+def shown(numbers: dict) -> dict[str, float | None]:
     """The measures of a score that tables show."""
-    return {name: numbers.get(capture, numbers.get(scene)) for name, (capture, scene) in measures.items()}
+    return {name: numbers.get(key) for name, key in MEASURES.items()}
 
 
-def outcome(
-    subject: Subject,
-    calibration: Calibration,
-    long_side: int,
-    config: FitConfig,
-    measures: Mapping[str, tuple[str, str]] = MEASURES,
-) -> dict:
+def outcome(subject: Subject, calibration: Calibration, long_side: int, config: FitConfig) -> dict:
     """What a table shows of one solve under a calibration: measures and CPU seconds, or why it was refused."""
     try:
         solved, spent = solve(subject, calibration, long_side, config)
     except UserError as error:
         return {"refused": str(error).split(";")[0]}
-    return shown(score(solved, subject), measures) | {"CPU s": spent}
+    return shown(score(solved, subject)) | {"CPU s": spent}

@@ -62,7 +62,7 @@ def test_a_solve_of_the_synthetic_scene_is_scored_against_its_truth(bench):
     assert ball.has_truth() and ball.pictures.stack is None and len(ball.calibration.lights) == 40
     truth = ball.truth
     perfect = SimpleNamespace(depth=truth.depth, normals=truth.normals, mask=truth.mask)
-    numbers = solves.shown(solves.compare_views(truth, solves.Prediction(**vars(perfect)), None))
+    numbers = solves.shown(solves.compare_views(truth, solves.Prediction(**vars(perfect))))
     assert numbers["depth"] == 0 and numbers["mask IoU"] == 1 and numbers["normals, deg"] < 1e-3
 
 

@@ -101,20 +101,16 @@ def test_the_report_asks_no_server_for_anything(whole_page):
     assert "default-src 'none'" in whole_page
 
 
-def test_a_run_that_stopped_early_says_what_its_finished_stages_cost(tmp_path, truth):
+def test_an_empty_folder_gets_a_report_and_a_run_that_stopped_early_says_where_why_and_at_what_cost(tmp_path, truth):
+    assert "There is no mesh" in Reader(page_of(tmp_path)).text
     fake_run.start_run(tmp_path, truth)
+    assert "There is no mesh. Stopped while fitting the surface." in Reader(page_of(tmp_path)).text
     with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path) as run:
         run.claim({}, {})
         with run.stage("calibrate"):
             pass
         raise KeyboardInterrupt
     assert "Finding camera and lights" in Reader(page_of(tmp_path)).text
-
-
-def test_an_empty_folder_gets_a_report_and_a_run_that_stopped_early_says_where_and_why(tmp_path, truth):
-    assert "There is no mesh" in Reader(page_of(tmp_path)).text
-    fake_run.start_run(tmp_path, truth)
-    assert "There is no mesh. Stopped while fitting the surface." in Reader(page_of(tmp_path)).text
     (tmp_path / "report.json").write_text(json.dumps({"error": "board found in 0 of 4 photos"}))
     assert "The run stopped: board found in 0 of 4 photos" in Reader(page_of(tmp_path)).text
 

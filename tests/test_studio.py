@@ -17,6 +17,7 @@ from capture.errors import CaptureError, UserError
 from capture.files.atomic import write_json
 from capture.files.title import TITLE, as_name, hand_title_on, keep_title, title_of
 from reconstruct.export.export import default_file
+from reconstruct.run_folder.lock import release_lock, take_lock
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.report.report import read_results
 from viewer.stage.files import StageFiles
@@ -50,6 +51,9 @@ def run_in(folder: Path, name: str, is_finished: bool = True, message: str = "")
     return run
 
 
+TITLED = "A cup / of tea: <b> " + "猫" * 80
+
+
 @pytest.fixture
 def folder(tmp_path) -> Path:
     (tmp_path / "studio").mkdir()
@@ -81,11 +85,14 @@ def test_titles_trash_and_return_survive_a_restart(folder):
     capture_in(folder, "vase")
     with served(folder) as (_, _, owner):
         owner.ok("rename", key="vase", title=" The blue  vase ")
-        cup = owner.ok("new", title="A cup / of tea")
+        cup = owner.ok("new", title=f"  {TITLED} ")
         assert (folder / cup).is_dir() and cup.startswith("captures/")
+        assert Path(owner.ok("start", key=cup, preset="draft")).name.endswith("-draft")
+        assert owner.get(f"/api/capture?key={quote(cup)}")[1]["title"] == TITLED
     with served(folder) as (_, _, owner):
-        cards = {card["key"]: card["title"] for card in owner.get("/api/state")[1]["cards"]}
-        assert cards == {"vase": "The blue vase", cup: "A cup / of tea"}
+        cards = {card["key"]: card for card in owner.get("/api/state")[1]["cards"]}
+        assert {key: card["title"] for key, card in cards.items()} == {"vase": "The blue vase", cup: TITLED}
+        assert [row["title"] for row in cards[cup]["runs"]] == [TITLED]
         owner.ok("delete", key="vase")
         assert not (folder / "vase").exists()
     with served(folder) as (_, _, owner):
@@ -161,13 +168,13 @@ def test_a_run_whose_files_are_damaged_is_a_card_all_the_same(folder):
 
 def test_a_second_studio_of_the_same_folder_leads_to_the_first(folder):
     first, opened, said = StudioFolder(folder), [], []
-    first.take()
-    first.note_address("http://localhost:1/?token=x")
+    take_lock(first.kept)
+    write_json(first.kept / "address.json", {"address": "http://localhost:1/?token=x"})
     pid = os.getpid()
     assert json.loads((folder / ".studio" / "lock").read_text())["pid"] == pid
     serve(folder, opens=opened.append, say=said.append)
     assert opened == ["http://localhost:1/?token=x&again=1"] and "is open already" in said[0]
-    first.release()
+    release_lock(first.kept)
 
 
 def test_what_is_no_folder_is_refused_in_a_sentence(folder):
@@ -279,19 +286,6 @@ NAMES = {  # of the folder or file that a title gets
 @pytest.mark.parametrize(("title", "name"), NAMES.items())
 def test_a_title_is_a_name_that_every_system_takes(title, name):
     assert as_name(title, "it") == name and len(name.encode()) < 250
-
-
-def test_the_title_that_was_typed_is_on_the_card_the_run_in_the_queue_and_after_a_restart(tmp_path):
-    title = "A cup / of tea: <b> " + "猫" * 80
-    with served(tmp_path) as (_, _, owner):
-        capture = owner.ok("new", title=f"  {title} ")
-        run = owner.ok("start", key=capture, preset="draft")
-        (card,) = owner.get("/api/state")[1]["cards"]
-        assert card["title"] == title and [row["title"] for row in card["runs"]] == [title]
-        assert owner.get(f"/api/capture?key={quote(capture)}")[1]["title"] == title
-        assert Path(run).name.endswith("-draft")
-    with served(tmp_path) as (_, _, owner):
-        assert owner.get("/api/state")[1]["cards"][0]["title"] == title
 
 
 def test_a_run_that_has_none_gets_the_title_of_its_capture_and_keeps_its_own(tmp_path):

@@ -42,7 +42,7 @@ def address(name: str, size: str = "") -> str:
 
 
 @pytest.mark.slow
-def test_a_run_is_saved_for_printing_in_the_size_that_was_asked_for(folder):
+def test_a_run_is_saved_in_the_size_that_was_asked_for_until_the_next_studio_forgets_it(folder):
     with served(folder) as (_, _, owner):
         rows = {row["name"]: row for row in owner.get("/api/formats")[1]}
         assert rows["3mf"]["sized"] and rows["stl"]["sized"] and not rows["html"]["sized"]
@@ -56,12 +56,7 @@ def test_a_run_is_saved_for_printing_in_the_size_that_was_asked_for(folder):
         whole = trimesh.load(folder / RUN / "mesh.ply").extents
         assert np.allclose(mesh.extents / mesh.extents.max(), whole / whole.max(), atol=1e-4)
         assert Client(owner.port).raw("GET", address("stl", "40")).status == 401
-
-
-@pytest.mark.slow
-def test_several_files_come_as_one_archive_and_are_forgotten_by_the_next_studio(folder):
-    with served(folder) as (_, _, owner):
-        found = made(owner, "normal-png")
+        found = made(owner, "normal-png")  # of several files: one archive
         assert found["file"] == "heap_normals.zip"
         assert owner.raw("GET", address("normal-png")).content[:2] == b"PK"
         assert list((folder / ".studio" / "saved").iterdir())

@@ -1,7 +1,4 @@
-"""export: write a finished run in one of FORMATS, the table of export formats, one row each.
-
-The row of the single-file page is in viewer/stage/page.py, where that page is made.
-"""
+"""export: write a finished run in one of FORMATS, the table of export formats, one row each."""
 
 import importlib.util
 import shutil
@@ -55,6 +52,12 @@ FORMATS: dict[str, Format] = {
         f"{_MESH}:threemf",
         takes=_PRINTED,
     ),
+    "html": Format(
+        ".html",
+        "A page to send to somebody",
+        "One file: the light follows the pointer, no server is needed.",
+        "",  # set in viewer/stage/page.py, where the page is made
+    ),
     "turntable": Format(
         ".mp4",
         "A video of the object turning",
@@ -91,7 +94,7 @@ FORMATS: dict[str, Format] = {
         ".stl",
         "For older 3D printers (STL)",
         "A closed solid; numbers are millimetres.",
-        f"{_MESH}:stl",
+        f"{_MESH}:plain",
         takes=_PRINTED,
     ),
     "obj": Format(
@@ -105,14 +108,14 @@ FORMATS: dict[str, Format] = {
         ".ply",
         "Every detail (PLY)",
         "The full mesh, a colour per vertex, what is known of each place.",
-        f"{_MESH}:ply",
+        f"{_MESH}:plain",
         takes=_FACES,
     ),
     "off": Format(
         ".off",
         "For geometry software (OFF)",
         "Corners and triangles as text.",
-        f"{_MESH}:off",
+        f"{_MESH}:plain",
         takes=_FACES,
     ),
     "normal-png": Format(

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt16
 from capture.decode.exr import write_exr
 from capture.errors import ReconstructionError
 from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, OnProgress
-from reconstruct.stored_run.maps import DEPTH, NORMALS, read_depth, read_normals
+from reconstruct.stored_run.maps import NORMALS
 from reconstruct.stored_run.stored_run import DETAIL, StoredRun
 
 FULL = 65535
@@ -42,7 +42,7 @@ def normals(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnP
 def depth(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> Contents:
     """Write z-depth along the camera's axis: channels Z and A (the object) of an EXR, or 16 bits of a PNG."""
     on_progress(0, 1, "depth")
-    values = read_depth(run.run_dir / DEPTH)
+    values = run.maps.depth
     seen = np.isfinite(values)
     if not seen.any():
         raise ReconstructionError("the camera sees no object, so there is no depth to save. Look at the report.")
@@ -67,7 +67,7 @@ def _contents(seen: Bool[np.ndarray, "height width"], said: str) -> Contents:
 
 def _normals(run: StoredRun) -> Float[np.ndarray, "height width 3"]:
     """Return normal.npy, refined with the detail from the full-size photos where the run has it."""
-    normals = read_normals(run.run_dir / NORMALS)
+    normals = run.maps.normals.copy()
     if run.detail is None:
         return normals
     window = run.detail.window

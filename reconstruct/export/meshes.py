@@ -111,27 +111,16 @@ def _size_for(run: StoredRun) -> int:
     return min(max(TEXTURE_STEP * steps, USUAL_TEXTURE), LARGEST_UNASKED)
 
 
-def ply(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> Contents:
-    """Write mesh.ply unchanged, or edited or reduced: normals and sRGB colours per vertex."""
-    mesh, contents = _solid(run, path, options, on_progress)
-    if mesh is run.mesh:
+def plain(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> Contents:
+    """Write PLY with normals and sRGB colours per vertex, mesh.ply itself where nothing changes it; OFF; or binary STL,
+    which stores no unit: millimetres for a phone capture, or the size that was asked for.
+    """
+    kind = path.suffix.lower().removeprefix(".")
+    mesh, contents = _solid(run, path, options, on_progress, options.print_size if kind == "stl" else None)
+    if kind == "ply" and mesh is run.mesh:
         path.write_bytes(read_regular(run.run_dir / MESH, LARGEST_FILE))
     else:
-        mesh.export(path, file_type="ply", vertex_normal=True)
-    return contents
-
-
-def stl(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> Contents:
-    """Write binary STL, which stores no unit: millimetres for a phone capture, or the size that was asked for."""
-    mesh, contents = _solid(run, path, options, on_progress, options.print_size)
-    mesh.export(path, file_type="stl")
-    return contents
-
-
-def off(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> Contents:
-    """Write OFF: vertices and faces as text."""
-    mesh, contents = _solid(run, path, options, on_progress)
-    mesh.export(path, file_type="off")
+        mesh.export(path, file_type=kind, **({"vertex_normal": True} if kind == "ply" else {}))
     return contents
 
 
@@ -168,7 +157,7 @@ def threemf(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnP
 
 
 def _solid(
-    run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress, print_size: float | None = None
+    run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress, print_size: float | None
 ) -> tuple[trimesh.Trimesh, Contents]:
     """Return the mesh with colours and normals, edited as the run says, reduced and scaled as the options ask.
 

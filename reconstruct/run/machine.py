@@ -1,9 +1,7 @@
 """Measure this machine's speed with a short loop of shadow rays, and plan from it how long each part of a run takes."""
 
-import importlib.util
 import os
 import platform
-import shutil
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -40,7 +38,6 @@ READING_S, DECODING_S, LIGHT_S, JUDGING_S = 0.09, 0.01, 0.15, 0.02  # a photo; d
 HULL_S, LABELS_S = 3.5, 0.5e-6  # of a run; a pixel of the solver's pictures, and a photo
 MESH_S, DETAIL_S, REPORT_S = 4e-5, 0.03, 1.5  # a squared node; a photo and a megapixel; of a run
 COMPILING_S = 18.0  # of the first run on a machine
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 GIB = 2**30
 FEWEST_SHARE = 0.25
 SIDES_RATIO = 0.75  # of a photo's sides
@@ -176,10 +173,7 @@ def describe_machine() -> list[str]:
         f"torch {torch.__version__}: {accelerator}",
         f"the surface is fitted on: {backend_name(solver_device('auto'))}",
         f"compiled parts: {compiled} ({_cache_folder()})",
-        f"browser for the tests: {next(filter(shutil.which, BROWSERS), 'none found; those tests are skipped')}",
     ]
-    has = importlib.util.find_spec("playwright") is not None
-    lines.append(f"playwright (browser tests): {'installed' if has else 'not installed, optional'}")
     for row in predicted_runs(36, 4032, 3024):
         seconds, memory = duration_text(float(row["seconds"])), f"{float(row['bytes']) / GIB:.1f} GiB of memory"
         lines.append(

@@ -167,13 +167,9 @@ class _SmallSolves:
 
 def _part(called: str, report: SolveReporter) -> SolveReporter:
     """Return a callback that reports a small solve as a part of what precedes the solve of all."""
-
-    def part(
-        *, stage: str, done: int, total: int, message: str, numbers: dict[str, float], surface: SdfGrid | None
-    ) -> None:
-        report(stage="hull", done=done, total=total, message=f"{called}: {message}", numbers={}, surface=None)
-
-    return part
+    return lambda *, message, **step: report(
+        **step | {"stage": "hull", "message": f"{called}: {message}", "numbers": {}, "surface": None}
+    )
 
 
 class RequestSteering:

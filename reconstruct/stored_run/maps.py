@@ -50,40 +50,16 @@ def read_maps(folder: Path, size: tuple[int, int] | None = None) -> Maps:
             f"{DEPTH}, {NORMALS} and {MASK} in {folder} are {sizes[0]}, {sizes[1]} and {sizes[2]} pixels (rows, "
             f"columns), {wanted} were needed. They have to be of the same photos."
         )
-    return Maps(_depths(depth, folder / DEPTH), _directions(normals, folder / NORMALS), mask)
-
-
-def read_depth(path: Path) -> Float32[np.ndarray, "height width"]:
-    """Read depth.npy.
-
-    Raises:
-        ReconstructionError: it cannot be read, or holds something else than depths.
-    """
-    return _depths(_numbers(path, ()), path)
-
-
-def read_normals(path: Path) -> Float32[np.ndarray, "height width 3"]:
-    """Read normal.npy.
-
-    Raises:
-        ReconstructionError: it cannot be read, or holds something else than normals.
-    """
-    return _directions(_numbers(path, (3,)), path)
-
-
-def _depths(depth: np.ndarray, path: Path) -> Float32[np.ndarray, "height width"]:
     seen = depth[depth != np.inf]
     if not (seen.min(initial=1) > 0 and seen.max(initial=1) <= LARGEST_DEPTH):  # false of NaN, too
-        raise refusal(path, "it holds something else than depths: positive numbers, or inf where no object is seen")
-    return depth
-
-
-def _directions(normals: np.ndarray, path: Path) -> Float32[np.ndarray, "height width 3"]:
+        said = "it holds something else than depths: positive numbers, or inf where no object is seen"
+        raise refusal(folder / DEPTH, said)
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.sqrt(np.einsum("hwc,hwc->hw", normals, normals))
     if not ((length == 0) | (np.abs(length - 1) <= NORMAL_ATOL)).all():
-        raise refusal(path, "it holds something else than normals: vectors of length 1, or 0 where no object is seen")
-    return normals
+        said = "it holds something else than normals: vectors of length 1, or 0 where no object is seen"
+        raise refusal(folder / NORMALS, said)
+    return Maps(depth, normals, mask)
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:

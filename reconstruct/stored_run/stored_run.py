@@ -81,18 +81,16 @@ class StoredRun:
         """
         first = self.calibration
         stored = {view.name: view.calibration for view in load_views(self.run_dir / CALIBRATION).every()}
-        found = [(seen.view, stored.get(seen.view), seen) for seen in self.fields.views()[1:]]
-        missing = [name for name, calibration, _ in found if calibration is None]
-        if missing:
-            raise ReconstructionError(
-                f"{self.run_dir}: {FIELDS} has a view {missing[0]!r:.80} that {CALIBRATION} lacks; both of one run "
-                "were needed. Run again, or ask for the folder again."
-            )
-        for name, calibration, seen in found:
-            if calibration is not None:
-                refuse_elsewhere(calibration, seen, self.run_dir / name)
-        rest = ((name, calibration, seen) for name, calibration, seen in found if calibration is not None)
-        return ((self.fields.view, first, self.fields.views()[0]), *rest)
+        found = [(self.fields.view, first, self.fields.views()[0])]
+        for seen in self.fields.views()[1:]:
+            if seen.view not in stored:
+                raise ReconstructionError(
+                    f"{self.run_dir}: {FIELDS} has a view {seen.view!r:.80} that {CALIBRATION} lacks; both of one run "
+                    "were needed. Run again, or ask for the folder again."
+                )
+            refuse_elsewhere(stored[seen.view], seen, self.run_dir / seen.view)
+            found.append((seen.view, stored[seen.view], seen))
+        return tuple(found)
 
     @cached_property
     def mesh(self) -> "trimesh.Trimesh":

@@ -68,11 +68,6 @@ def page_scale(calibration: Calibration) -> PageScale:
     return PageScale(CAMERA_DISTANCE / distance, eye + distance * forward)
 
 
-def wxyz(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
-    """Return the quaternion of a rotation, real part first."""
-    return viser.transforms.SO3.from_matrix(rotation).wxyz
-
-
 def light_position(light: Light, scale: PageScale) -> Float[np.ndarray, "3"]:
     """Return where a light is drawn, page units: its position, or, of a directional one, that way from the centre."""
     if light.position is not None:
@@ -171,7 +166,7 @@ def draw_camera(host: Host, calibration: Calibration, scale: PageScale, number: 
         color=PLAIN,
         thickness=0.009,
         format="jpeg",
-        wxyz=wxyz(pose.rotation),
+        wxyz=viser.transforms.SO3.from_matrix(pose.rotation).wxyz,
         position=scale.to_page(pose.translation),
         cast_shadow=False,
         receive_shadow=False,

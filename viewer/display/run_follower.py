@@ -1,6 +1,5 @@
 """RunFollower: what a run folder holds at any moment. Only what has changed is read again."""
 
-import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,12 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.errors import UserError
-from capture.files.regular import is_own_folder, open_regular
-from reconstruct.run_folder.folder import LARGEST_LOG, LOG
+from capture.files.regular import is_own_folder
+from reconstruct.run_folder.folder import LOG, read_log
 from reconstruct.run_folder.forecast import STAGE_NAMES, Forecast
 from reconstruct.run_folder.lock import LOCK, is_abandoned
 from reconstruct.run_folder.requests import PAUSED, REQUESTS_FOLDER
-from reconstruct.stored_run.documents import log_lines
 from reconstruct.stored_run.maps import THUMBS, read_thumbnail
 from reconstruct.stored_run.stored_run import CALIBRATION, FIELDS, MESH
 
@@ -30,7 +28,6 @@ FIT_WORDS = {
 
 HULL, PREVIEW = "hull.ply", "preview.ply"
 SHOWN = (LOG, LOCK, CALIBRATION, PREVIEW, HULL, MESH, FIELDS, THUMBS, REQUESTS_FOLDER)  # on a page
-HEAD = 256  # bytes of a log by which it is known again: more than its first time stamp
 AFTER_MESH = (
     "detail",
     "report",
@@ -58,9 +55,8 @@ class RunFollower:
 
     path: Path
     _seen: dict[str, tuple[int, int, int]] = field(default_factory=dict)
-    _lines: list[dict[str, Any]] = field(default_factory=list)  # of the log, as far as it was read
-    _head: bytes = b""
-    _read: int = 0  # bytes
+    _lines: list[dict[str, Any]] = field(default_factory=list)  # of the log
+    _read: tuple[int, int, int] | None = None  # the mark of the log when it was read
     _marks: tuple[tuple[int, int, int] | None, ...] = ()
 
     def changed(self, name: str) -> bool:
@@ -88,22 +84,13 @@ class RunFollower:
         return (stat.st_mtime_ns, stat.st_size, stat.st_ino)
 
     def log(self) -> list[dict[str, Any]]:
-        """Return every line of the log so far; none of a log that no run writes. Only what was added is read."""
-        try:
-            with open_regular(self.path / LOG, LARGEST_LOG) as file:
-                head = file.read(HEAD)
-                if not head.startswith(self._head) or file.seek(0, os.SEEK_END) < self._read:  # another run's
-                    self._lines, self._head, self._read = [], b"", 0
-                file.seek(self._read)
-                added = file.read()
-        except OSError:
-            self._lines, self._head, self._read = [], b"", 0
-            return []
-        whole = added[: added.rfind(b"\n") + 1]
-        self._lines += log_lines(whole)
-        self._read += len(whole)
-        self._head = head[: self._read]
-        return [*self._lines, *log_lines(added[len(whole) :])]
+        """Return every line of the log so far; none of a log that no run writes. It is read when it has changed."""
+        if (mark := self._mark(LOG)) != self._read or mark is None:
+            try:
+                self._lines, self._read = read_log(self.path / LOG), mark
+            except OSError:
+                self._lines, self._read = [], None
+        return self._lines
 
     def is_running(self) -> bool:
         """Return whether a living process holds this run."""

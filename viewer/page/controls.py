@@ -71,13 +71,9 @@ class Steering:
         icons = viser.Icon
         self._pause = gui.add_button("Pause", icon=icons.PLAYER_PAUSE, hint=HINTS[PAUSE], visible=False)
         self._go_on = gui.add_button("Go on", icon=icons.PLAYER_PLAY, visible=False)
-        self._next, self._stop = (
-            gui.add_button(label, icon=icon, color=QUIET, hint=HINTS[name], visible=False)
-            for label, icon, name in (
-                ("Finer now", icons.PLAYER_TRACK_NEXT, NEXT_LEVEL),
-                ("Stop and save", icons.DEVICE_FLOPPY, STOP),
-            )
-        )
+        quiet: dict[str, Any] = {"color": QUIET, "visible": False}
+        self._next = gui.add_button("Finer now", icon=icons.PLAYER_TRACK_NEXT, hint=HINTS[NEXT_LEVEL], **quiet)
+        self._stop = gui.add_button("Stop and save", icon=icons.DEVICE_FLOPPY, hint=HINTS[STOP], **quiet)
         self._resolution = gui.add_dropdown(
             "Resolution", (AS_PLANNED, *RESOLUTIONS), initial_value=AS_PLANNED, hint=HINTS[AS_PLANNED], visible=False
         )
@@ -236,10 +232,8 @@ def _status_card(now: Status, *remarks: str) -> str:
             '<div style="height:6px;border-radius:3px;background:rgba(128,128,128,.25);margin:.5rem 0 .35rem">'
             f'<div style="height:6px;border-radius:3px;width:{width:.0f}%;background:rgb{BRAND}"></div></div>'
         )
-    facts = [now.counts, "" if now.is_over else left_text(now.left_s)]
-    facts.append(
-        f"{duration_text(now.elapsed_s)} so far" if not now.is_over else f"took {duration_text(now.elapsed_s)}"
-    )
+    took = duration_text(now.elapsed_s)
+    facts = [now.counts, f"took {took}"] if now.is_over else [now.counts, left_text(now.left_s), f"{took} so far"]
     lines = [" · ".join(f for f in facts if f), now.message, *remarks]
     body = "".join(f'<div style="{MUTED};margin-top:.15rem">{html.escape(line)}</div>' for line in lines if line)
     return (

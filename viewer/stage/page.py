@@ -6,6 +6,7 @@ Its parts are packed in stage.zip, which `shadowgraph run` leaves; a run without
 import html
 import json
 import re
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 from capture.errors import ReconstructionError, UserError
 from capture.files.atomic import atomic_file
 from capture.files.title import title_of
-from reconstruct.export.export import FORMATS, UNIT_WORDS, Contents, ExportOptions, Format, OnProgress
+from reconstruct.export.export import FORMATS, UNIT_WORDS, Contents, ExportOptions, OnProgress
 from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
 from reconstruct.stored_run.stage_pack import STAGE_PACK, StagePack, addressed, marks_of, read_stage_pack
 from reconstruct.stored_run.stored_run import FIELDS, MESH, StoredRun
@@ -38,16 +39,7 @@ SCRIPTS = (
 SHADERS = ("surface.vert", "surface.frag", "depth.frag", "full.vert", "light.frag", "blur.frag", "show.frag")
 SHADERS += ("lines.vert", "lines.frag")
 IMPORTED, EXPORTED = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL), re.compile(r"^export ", re.MULTILINE)
-PAGE = Format(
-    ".html",
-    "A page to send to somebody",
-    "One file: the light follows the pointer, no server is needed.",
-    "viewer.stage.page:write_page",
-)
-_rows = list(FORMATS.items())
-_rows.insert(list(FORMATS).index("3mf") + 1, ("html", PAGE))  # behind which a person looks for it
-FORMATS.clear()
-FORMATS.update(_rows)
+FORMATS["html"] = replace(FORMATS["html"], writer="viewer.stage.page:write_page")
 
 
 def is_finished(run_dir: Path) -> bool:
@@ -147,7 +139,8 @@ def page_html(
         fault: the verdict on a result that is not good; in a "frame" the page around it says it.
     """
     is_served = saves == "socket"
-    facts = addressed(pack.facts, {part: as_address(pack.read(part), kind_of(part)) for part in pack.names})
+    kinds = {part: "image/jpeg" if part.endswith(".jpg") else "application/octet-stream" for part in pack.names}
+    facts = addressed(pack.facts, {part: as_address(pack.read(part), kind) for part, kind in kinds.items()})
     values = {
         "title": html.escape(name),
         "size": html.escape(str(facts["size"])),
@@ -191,11 +184,6 @@ def script_text() -> str:
     """
     parts = [EXPORTED.sub("", IMPORTED.sub("", _asset(f"{name}.js"))) for name in SCRIPTS]
     return "\n" + "\n".join(parts)
-
-
-def kind_of(part: str) -> str:
-    """Return the media type of a part."""
-    return "image/jpeg" if part.endswith(".jpg") else "application/octet-stream"
 
 
 def write_page(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> Contents:

@@ -20,7 +20,6 @@ from capture.files.schema import Count, FileName, Number, Text, read_kept
 from capture.files.title import as_name, keep_title
 from reconstruct.run.batch import looks_like_capture
 from reconstruct.run_folder.folder import LOG
-from reconstruct.run_folder.lock import LOCK, lock_holder, release_lock, take_lock
 from reconstruct.stored_run.documents import MANIFEST
 
 KEPT, CAPTURES, RUNS = ".studio", "captures", "runs"
@@ -62,30 +61,6 @@ class StudioFolder:
         places = [place for place in (root, root / CAPTURES, root / RUNS) if place.is_dir()]
         folders = [path for place in places for path in sorted(place.iterdir())[:MOST_LOOKED_INTO] if path.is_dir()]
         return any(not path.name.startswith(".") and (is_run(path) or is_capture(path)) for path in folders)
-
-    # --- one studio for each folder ----------------------------------------------------------------------------------
-
-    def take(self) -> None:
-        """Take the folder for this process.
-
-        Raises:
-            UserError: another studio has it.
-        """
-        take_lock(self.kept)
-
-    def release(self) -> None:
-        """Let the folder go."""
-        release_lock(self.kept)
-
-    def holder_address(self) -> str | None:
-        """Return the address of the studio that has this folder; None where none has it."""
-        if lock_holder(self.kept / LOCK) is None:
-            return None
-        return (read_kept(self.kept / ADDRESS, dict) or {}).get("address")
-
-    def note_address(self, address: str) -> None:
-        """Keep the address for a second studio that is started by mistake; only this user can read it."""
-        write_json(self.kept / ADDRESS, {"address": address})
 
     def token(self) -> str:
         """Return the secret of the address; it stays the same, so that an open page survives a restart."""

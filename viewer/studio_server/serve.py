@@ -18,8 +18,11 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from capture.errors import CaptureError, UserError
+from capture.files.atomic import write_json
+from capture.files.schema import read_kept
+from reconstruct.run_folder.lock import release_lock, take_lock
 from viewer.page.guard import COOKIE
-from viewer.studio.folder import CAPTURES, RUNS, StudioFolder, is_capture, is_run
+from viewer.studio.folder import ADDRESS, CAPTURES, RUNS, StudioFolder, is_capture, is_run
 from viewer.studio.studio import Studio
 from viewer.studio_server.gate import (
     FILES,
@@ -109,9 +112,9 @@ def serve(
     place, at = _studio_of(root)
     folder = StudioFolder(place)
     try:
-        folder.take()
+        take_lock(folder.kept)
     except UserError:
-        address = folder.holder_address()
+        address = (read_kept(folder.kept / ADDRESS, dict) or {}).get("address")
         if address is None:
             raise
         say(f"The studio of {folder.root} is open already. Open {address}")
@@ -119,12 +122,12 @@ def serve(
             opens(f"{address}&again=1{at}")
         return
     with contextlib.ExitStack() as ending:
-        ending.callback(folder.release)
+        ending.callback(release_lock, folder.kept)
         studio = Studio(folder)
         phones = Phones(folder.kept / "phones.json", folder.kept / "phones", partial(phone_app, studio))
         token, listener = folder.token(), ending.enter_context(free_socket(HOST, port))
         address = f"http://localhost:{listener.getsockname()[1]}/?token={token}"
-        folder.note_address(address)
+        write_json(folder.kept / ADDRESS, {"address": address})  # for a second studio that is started by mistake
         server = http_server(Gate(owner_app(studio, phones), HOST, OwnerSecret(token)))
         studio.start()
         ending.callback(studio.close)
