@@ -16,13 +16,11 @@ EYE = np.array([0.0, -420.0, 380.0])
 
 
 def ball_camera(eye: np.ndarray = EYE) -> PosedCamera:
-    """Return a camera that looks at the ball's middle."""
     pose = looking_at(eye, MIDDLE)
     return PosedCamera(Camera(WIDTH, HEIGHT, 260.0, 260.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2), pose, 0.0)
 
 
 def ball_lights(count: int = 14) -> np.ndarray:
-    """Return lights around the ball, world."""
     turn = 2.4 * np.arange(count)
     up = np.radians(30 + 40 * np.modf(0.618 * np.arange(count))[0])
     distance = 450 + 150 * np.modf(0.35 * np.arange(count))[0]
@@ -55,7 +53,6 @@ def photographed() -> tuple[PosedCamera, np.ndarray, GroundField, GroundShadows]
 
 
 def drawn():
-    """Return camera, lights and maps."""
     camera, lights, field, shadows = photographed()
     maps = outline_maps(field, shadows, camera)
     assert maps is not None

@@ -12,8 +12,8 @@ import pytest
 import torch
 from synthetic import BALL, Look, render
 from test_light_refine import misplaced
+from test_render import SHARPNESS, ball, grey_rays
 from test_trainer import TINY
-from test_visibility import SHARPNESS, ball, grey_rays
 
 from reconstruct.config import FitConfig, Level
 from reconstruct.fields import SolvedScene

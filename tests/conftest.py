@@ -34,7 +34,7 @@ LONGEST_FIRST = (  # seconds of a file are not known before it ran: these took 8
     "test_list_axes",
     "test_stage_page",
     "test_studio_first_screen_browser",
-    "test_wall",
+    "test_response",
     "test_board_scale",
     "test_field_ground",
     "test_stage_served",
@@ -234,6 +234,13 @@ def bench(monkeypatch) -> Callable[[str], ModuleType]:
     """The modules of benchmarks/ by name, as a command there imports them."""
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     return importlib.import_module
+
+
+@pytest.fixture(scope="session")
+def renderer() -> None:
+    """What examples/generator needs; a test is skipped, visibly, where it is not installed."""
+    for name in ("mitsuba", "embreex"):
+        pytest.importorskip(name, reason=f"{name} is not installed: pip install 'shadowgraph[generator]'")
 
 
 @pytest.fixture

@@ -101,6 +101,7 @@ def write_s3nerf(folder: Path, truth: Truth, unit: float = 0.01, below: float = 
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = pose.rotation @ OPENGL, pose.translation * unit + shift
     lights = np.repeat(places(truth) * unit + shift, 2, axis=0)
+    lights[::2] += 1.0  # those of photos 1, 3, 5, ..., which are not there
     for i, rgb in enumerate(truth.stack.rgb):
         write_photo(folder / "rgb" / f"{2 * i + 2:03d}.png", rgb, "linear8")
         write_grey(folder / "visibility" / f"{2 * i + 2:03d}.png", truth.visibility[i])

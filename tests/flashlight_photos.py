@@ -32,8 +32,6 @@ POSED_CAMERA = PosedCamera(CAMERA, WORLD_FROM_CAMERA, 0.0)
 
 @dataclass(frozen=True)
 class Truth:
-    """What the photos were made from."""
-
     stack: PhotoStack
     lights: tuple[Light, ...]
 
@@ -54,8 +52,6 @@ class Truth:
 
 @dataclass(frozen=True)
 class Recipe:
-    """What the photos are like."""
-
     n_photos: int = 10
     noise: float = 0.01  # relative, per pixel
     shadows: bool = True  # an object in the middle and its shadow
@@ -69,7 +65,6 @@ class Recipe:
     lights: tuple[Light, ...] = field(default=())
 
     def posed_camera(self) -> PosedCamera:
-        """Return the camera of the photos."""
         return PosedCamera(
             CAMERA, replace(WORLD_FROM_CAMERA, translation=self.near * WORLD_FROM_CAMERA.translation), 0.0
         )

@@ -24,8 +24,6 @@ WORKING = 120  # px, longer side of the picture that the surface was solved at
 
 @dataclass(frozen=True)
 class Relief:
-    """The photos and what is true of them."""
-
     paths: tuple[Path, ...]
     calibration: Calibration
     fields: SolvedScene

@@ -6,6 +6,7 @@ Millimetres, ground z = 0. One ray per pixel centre, exact hard shadows, Lambert
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from calibration.camera import Camera
 from calibration.light import Light, beam_gain
 from calibration.pose import Pose
 from capture.photos.photo import PhotoStack
+from reconstruct.labels.labels import Labels
 from reconstruct.scene import Scene, build_scene
 from reconstruct.sdf.grid import SdfGrid
 
@@ -115,6 +117,27 @@ class Truth:
     def sdf(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Exact distance to the union of the shapes, mm; where shapes overlap inside, a lower bound of it."""
         return np.min([_distance(shape, points) for shape in self.shapes], axis=0)
+
+    def overlap(self, mask: object) -> float:
+        """Of what a mask calls object with the object: intersection over union."""
+        found = np.asarray(mask) > 0.5
+        return float((found & self.mask).sum() / (found | self.mask).sum())
+
+    def degrees(self, normals: object) -> Float[np.ndarray, "height width"]:
+        """Angles of unit normals from the true ones."""
+        return np.degrees(np.arccos(np.clip((np.asarray(normals) * self.normals).sum(-1), -1, 1)))
+
+    def wrong(self, labels: Any, where: Bool[np.ndarray, "height width"] | None = None) -> float:
+        """Share of wrong labels of visibility by their confidence, on the ground or the pixels of a mask."""
+        weight = labels.confidence.numpy() * (~self.mask if where is None else where)
+        wrong = (labels.visibility.numpy() > 0.5) != (self.visibility > 0.5)
+        return float((wrong * weight).sum() / weight.sum())
+
+    def labels(self, confidence: float = 1.0) -> Labels:
+        """What is true of mask and normals, and of visibility with this confidence; no albedo."""
+        mask, normals, seen = (torch.from_numpy(x).float() for x in (self.mask, self.normals, self.visibility))
+        certain = torch.ones_like(mask)
+        return Labels(seen, torch.full_like(seen, confidence), mask, certain, normals, mask, 0 * normals)
 
 
 def render(

@@ -56,13 +56,11 @@ def detail(ball, tmp_path_factory):
 
 
 def inside(detail, picture):
-    """The window's part of a picture of the whole photo."""
     w = detail.window
     return picture[w.top : w.top + w.height, w.left : w.left + w.width]
 
 
 def facing(normals):
-    """Unit normals of samples as they are stored."""
     stored = normals.astype(float)
     return stored / np.maximum(np.linalg.norm(stored, axis=-1, keepdims=True), 1)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from synthetic import BALL, HEAP, Box, Look, Sphere, Truth, render
+from synthetic import BALL, HEAP, Box, Look, Sphere, render
 
 from calibration.ground.shadow_reach import most_height, shadow_reach
 from reconstruct.labels import ground_test as ground_module
@@ -34,16 +34,6 @@ def spotted(scene: Scene, seed: int = 0) -> tuple[Scene, np.ndarray]:
     return replace(scene, rgb=rgb), gain
 
 
-def overlap(found: np.ndarray, true: np.ndarray) -> float:
-    return float((found & true).sum() / (found | true).sum())
-
-
-def wrong_labels(labels, truth: Truth) -> float:
-    weight = labels.confidence.numpy() * ~truth.mask
-    wrong = (labels.visibility.numpy() > 0.5) != (truth.visibility > 0.5)
-    return float((wrong * weight).sum() / weight.sum())
-
-
 @pytest.fixture(scope="module")
 def heap():
     scene, truth = render(HEAP, LOOK)
@@ -55,8 +45,8 @@ def test_the_field_labels_what_the_lights_model_cannot(heap):
     assert by_the_lights(scene).explained < 0.5
     found = label_ground(scene)
     assert found.bare is not None
-    assert overlap(found.mask.numpy() > 0.5, truth.mask) > 0.9
-    assert wrong_labels(found, truth) < 0.02
+    assert truth.overlap(found.mask) > 0.9
+    assert truth.wrong(found) < 0.02
     dark = (truth.visibility == 0) & ~truth.mask
     assert (found.confidence.numpy()[dark] > 0.25).mean() > 0.5
     assert found.albedo.isfinite().all() and found.gain.isfinite().all() and found.ambient > 0
@@ -73,8 +63,8 @@ def test_powers_follow_the_object_and_its_normals_with_them():
     assert np.std(ratio) < 0.7 * np.std(np.log(gain))
 
     def error(one: Scene) -> float:
-        normals = label_object(one, points, None, ground.mask, ground).normals.numpy()[truth.mask]
-        return float(np.degrees(np.arccos(np.clip((normals * truth.normals[truth.mask]).sum(-1), -1, 1))).mean())
+        normals = label_object(one, points, None, ground.mask, ground).normals
+        return float(truth.degrees(normals)[truth.mask].mean())
 
     assert error(freed) < 0.8 * error(scene)
 
@@ -115,8 +105,8 @@ def test_where_both_ways_explain_the_table_the_powers_decide():
     by_model, by_field = label_ground(known), label_ground(unknown)
     assert by_model.bare is None and by_field.bare is not None
     for found in (by_model, by_field):
-        assert overlap(found.mask.numpy() > 0.5, truth.mask) > 0.9
-        assert wrong_labels(found, truth) < 0.02
+        assert truth.overlap(found.mask) > 0.9
+        assert truth.wrong(found) < 0.02
     again = label_ground(unknown, by_field)
     assert torch.equal(again.mask, by_field.mask) and torch.equal(again.visibility, by_field.visibility)
 
@@ -127,9 +117,9 @@ def test_an_object_nearly_black_is_no_ground_in_shadow(off):
     ball = Sphere((0.0, -50.0, 20.0), 20.0, (0.02, 0.02, 0.02))
     scene, truth = render((ball,), replace(LOOK, noise=0.01))
     scene = before_a_wall(scene, off)
-    assert overlap(by_the_lights(scene).mask.numpy() > 0.5, truth.mask) < 0.5
+    assert truth.overlap(by_the_lights(scene).mask) < 0.5
     found = label_ground(scene)
-    assert overlap(found.mask.numpy() > 0.5, truth.mask) > 0.95
+    assert truth.overlap(found.mask) > 0.95
     assert (found.confidence.numpy() * truth.mask)[:, found.mask.numpy() > 0.5].max() < 0.05  # no shadows on it
     moved = label_ground(replace(scene, lights=scene.lights * torch.tensor([1.02, 1.02, 1.02, 1.0])), found)
     assert torch.equal(moved.mask, found.mask)
@@ -154,16 +144,11 @@ def shares(found, truth) -> tuple[float, float]:
     return float((found.mask.numpy() > 0.5)[top].mean()), float(ground.numpy()[top].mean())
 
 
-def iou(found, truth) -> float:
-    mask = found.mask.numpy() > 0.5
-    return (mask & truth.mask).sum() / (mask | truth.mask).sum()
-
-
 @pytest.mark.parametrize("height", [3.5, 5.0, 30.0])
 def test_the_level_top_of_a_box_coloured_like_the_ground_is_object_under_near_lights(height):
     scene, truth = render((slab(height),), NOISY)
     found = ground_module.test_ground(scene)
-    assert shares(found, truth)[0] > 0.97 and iou(found, truth) > 0.97
+    assert shares(found, truth)[0] > 0.97 and truth.overlap(found.mask) > 0.97
 
 
 def test_textured_ground_stays_ground_around_and_between_objects():
@@ -171,7 +156,7 @@ def test_textured_ground_stays_ground_around_and_between_objects():
     scene, truth = render(shapes, replace(NOISY, texture=0.4, ambient=0.05))
     found = ground_module.test_ground(scene)
     bare = ~truth.mask & (found.mask.numpy() < 0.5)
-    assert iou(found, truth) > 0.97
+    assert truth.overlap(found.mask) > 0.97
     assert (found.mask_confidence.numpy() > 0)[bare].mean() > 0.995
 
 

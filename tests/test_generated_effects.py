@@ -1,17 +1,15 @@
 """Effects of phones, rooms and hands in generated captures: poses, beams, sheets and accidents."""
 
-import json
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
+from test_generator import seen_points, truth
 
 from calibration.board.board import parse_board
 from calibration.board.corners import find_board
-from calibration.camera import Camera
-from calibration.pose import Pose
 from capture.decode.exif import read_header
 from capture.errors import CaptureError
 from capture.session.session import load_session
@@ -31,7 +29,6 @@ def scene(setup: Setup) -> tuple[trimesh.Trimesh, poses.Viewpoint]:
 
 
 def never(start: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Return that nothing is in the way of rays."""
     return np.zeros(len(along), bool)
 
 
@@ -59,10 +56,8 @@ def test_photos_that_there_are_not_cannot_be_spoilt():
 
 
 @pytest.fixture(scope="module")
-def hard_capture(tmp_path_factory):
+def hard_capture(renderer, tmp_path_factory):
     """A small capture with everything on, and photos from the side, from the flashlight and without it."""
-    for name in ("mitsuba", "embreex"):
-        pytest.importorskip(name, reason=f"{name} is not installed: pip install 'shadowgraph[generator]'")
     from examples.generator import rendering
     from examples.generator.capturing import make_capture
 
@@ -82,10 +77,6 @@ def hard_capture(tmp_path_factory):
         patch.setattr(rendering, "ROOM_SAMPLES", 8)  # noisier, in half of the time
         make_capture(folder / "capture", setup, lambda text: None)
     return folder / "capture"
-
-
-def truth(capture, name):
-    return json.loads((capture / "gt" / f"{name}.json").read_text())
 
 
 def test_the_session_reads_it_and_the_truth_says_what_went_wrong(hard_capture):
@@ -117,22 +108,13 @@ def test_corners_of_the_wavy_board_are_where_the_truth_says_from_everywhere(hard
 
 
 def test_the_wall_is_in_the_maps_and_is_no_table(hard_capture):
-    wall = truth(hard_capture, "ground")["wall"]
-    camera = truth(hard_capture, "camera")["stored"]
-    with np.load(hard_capture / "gt" / "maps.npz") as maps:
-        depth, table, mask = maps["depth_mm"].astype(float), maps["table"], maps["mask"]
-    behind = ~table & ~mask & np.isfinite(depth)
+    wall, (points, maps) = truth(hard_capture, "ground")["wall"], seen_points(hard_capture)
+    behind = ~maps["table"] & ~maps["mask"] & np.isfinite(maps["depth_mm"])
     assert behind.mean() > 0.02
-    k = np.array(camera["K"])
-    lens = Camera(240, 180, k[0, 0], k[1, 1], k[0, 2], k[1, 2], tuple(camera["dist_k1_k2_p1_p2_k3"]))
-    pose = Pose.from_matrix(np.array(camera["T_cam_from_board"])).inverse()
-    points = pose.apply(lens.unproject(lens.pixel_grid()) * np.where(behind, depth, 0)[..., None])[behind]
-    assert np.allclose(points @ wall["normal"], wall["offset_mm"], atol=0.01)
+    assert np.allclose(points[behind] @ wall["normal"], wall["offset_mm"], atol=0.01)
 
 
-def test_a_table_ends_at_its_edge_and_a_floor_lies_below():
-    for name in ("mitsuba", "embreex"):
-        pytest.importorskip(name, reason=f"{name} is not installed: pip install 'shadowgraph[generator]'")
+def test_a_table_ends_at_its_edge_and_a_floor_lies_below(renderer):
     from examples.generator import truth as maps
     from examples.generator.rendering import stage
 

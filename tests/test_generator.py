@@ -24,10 +24,8 @@ BOARD = "checkerboard:5x4:36"
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory):
+def capture(renderer, tmp_path_factory):
     """A small capture without noise, room light and bounces."""
-    for name in ("mitsuba", "embreex"):
-        pytest.importorskip(name, reason=f"{name} is not installed: pip install 'shadowgraph[generator]'")
     from examples.generator.capturing import make_capture
 
     mesh = tmp_path_factory.mktemp("mesh") / "ball.ply"
@@ -49,6 +47,18 @@ def truth(capture, name):
     return json.loads((capture / "gt" / f"{name}.json").read_text())
 
 
+def seen_points(capture):
+    """What each stored pixel sees, in the board's frame (the camera's place: nothing), and the maps by their names."""
+    stored = truth(capture, "camera")["stored"]
+    with np.load(capture / "gt" / "maps.npz") as file:
+        maps = dict(file)
+    depth, k = maps["depth_mm"].astype(float), np.array(stored["K"])
+    size = depth.shape[::-1]
+    lens = Camera(*size, k[0, 0], k[1, 1], k[0, 2], k[1, 2], tuple(stored["dist_k1_k2_p1_p2_k3"]))
+    pose = Pose.from_matrix(np.array(stored["T_cam_from_board"])).inverse()
+    return pose.apply(lens.unproject(lens.pixel_grid()) * np.where(np.isfinite(depth), depth, 0)[..., None]), maps
+
+
 def test_a_lens_puts_a_point_where_the_camera_projects_it():
     camera = Camera(160, 120, 170.0, 170.0, 81.0, 58.5, (-0.1, 0.05, 0.0, 0.0, 0.0))
     lens = lens_of(camera, 2)
@@ -63,13 +73,8 @@ def test_a_lens_puts_a_point_where_the_camera_projects_it():
 
 @pytest.mark.slow
 def test_lit_ground_has_the_brightness_of_the_formula(capture):
-    lights, camera = truth(capture, "lights"), truth(capture, "camera")["stored"]
-    with np.load(capture / "gt" / "maps.npz") as maps:
-        depth, table = maps["depth_mm"].astype(float), maps["table"]
-    k = np.array(camera["K"])
-    lens = Camera(320, 240, k[0, 0], k[1, 1], k[0, 2], k[1, 2], tuple(camera["dist_k1_k2_p1_p2_k3"]))
-    pose = Pose.from_matrix(np.array(camera["T_cam_from_board"])).inverse()
-    points = pose.apply(lens.unproject(lens.pixel_grid()) * depth[..., None])
+    lights, (points, maps) = truth(capture, "lights"), seen_points(capture)
+    table = maps["table"]
     assert np.allclose(points[table][:, 2], -0.15, atol=1e-3)
     emitter, albedo, everywhere = lights["emitter"], [], table
     for entry in lights["photos"]:
@@ -92,8 +97,7 @@ def test_lit_ground_has_the_brightness_of_the_formula(capture):
 
 @pytest.mark.parametrize("spec", ["paper:A4", "card"])
 @pytest.mark.slow
-def test_the_edges_of_a_blank_board_are_rendered_where_the_truth_says(spec):
-    pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install 'shadowgraph[generator]'")
+def test_the_edges_of_a_blank_board_are_rendered_where_the_truth_says(renderer, spec):
     from examples.generator import poses
     from examples.generator.rendering import room, stage
 

@@ -11,11 +11,9 @@ from scipy import ndimage
 from synthetic import BALL, Look, Sphere, Truth, grid_of, render
 from test_mesh import glb_parts
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from calibration.light import Light, irradiance
-from reconstruct.appearance.brdf import LOBES, Material, facing_reflectance, specular
-from reconstruct.appearance.joint_fit import fit_normals
+from reconstruct.appearance.brdf import Material, facing_reflectance, specular
 from reconstruct.appearance.lobe_fit import Indirect, Samples, fit_lobes, from_endless_ground
 from reconstruct.fields import SolvedScene
 from reconstruct.labels.ground_test import test_ground as check_ground
@@ -45,7 +43,6 @@ def tensor(values: np.ndarray) -> Tensor:
 
 
 def dark(scene: Scene) -> Indirect:
-    """No light from the ground."""
     return from_endless_ground(torch.zeros(len(scene.lights)))
 
 
@@ -122,8 +119,7 @@ def test_wide_highlights_and_misstated_powers_do_not_tilt_normals_without_a_grou
 
 
 def mean_angle(normals: Float[Tensor, "height width 3"], truth: Truth) -> float:
-    cosine = (normals.numpy() * truth.normals).sum(-1)[truth.mask]
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
+    return float(truth.degrees(normals)[truth.mask].mean())
 
 
 def test_a_matt_ball_has_no_lobes_and_its_photos_stay_as_they_are(matt):
@@ -199,43 +195,3 @@ def test_ground_without_a_lit_label_gets_its_albedo_where_the_surface_lets_light
     assert shade.sum() > 50 and not found[shade].any()
     assert np.median(np.abs(found / truth.albedo - 1)[light]) < 0.02
     assert np.array_equal(found[truth.mask], truth.albedo[truth.mask].astype(np.float32))
-
-
-# --- normals and albedos of pixels whose lobes are known -------------------------------------------------------------
-
-
-PIXELS, PHOTOS = 300, 24
-LIT = 0.02  # of what the tilted start is off, without noise
-
-
-def samples(is_glossy: bool) -> tuple[Samples, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Noiseless samples with tilted normals to begin from, and their lobes, true normals and albedos."""
-    torch.manual_seed(0)
-    up, sideways = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, 1.0, 0.0])
-    true = normalize(0.4 * sideways * torch.randn(PIXELS, 3) + up, dim=-1)
-    eye = normalize(0.1 * torch.randn(PIXELS, 3) + up, dim=-1)
-    lights = normalize(0.7 * sideways * torch.randn(PHOTOS, 3) + up, dim=-1)
-    towards = normalize(lights + 0.02 * torch.randn(PIXELS, 1, 3), dim=-1)
-    lobes = torch.zeros(LOBES, 3)
-    if is_glossy:
-        lobes[1], lobes[3] = torch.tensor([0.2, 0.15, 0.1]), 0.1
-    strength, indirect = torch.ones(PIXELS, PHOTOS, 3), torch.full((PIXELS, PHOTOS, 3), 0.02)
-    albedo = 0.2 + 0.5 * torch.rand(PIXELS)
-    cosine = (towards * true[:, None]).sum(-1, keepdim=True).clamp(min=0)
-    mirrored = specular(lobes, true[:, None], towards, eye[:, None])
-    value = (albedo[:, None, None] + mirrored) * cosine * strength + albedo[:, None, None] * indirect
-    start = normalize(true + 0.1 * torch.randn(PIXELS, 3), dim=-1)
-    return Samples(value, torch.ones(PIXELS, PHOTOS), strength, indirect, towards, eye, start), lobes, true, albedo
-
-
-def angles(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Radians between unit vectors."""
-    return 2 * ((a - b).norm(dim=-1) / 2).clamp(max=1).asin()
-
-
-@pytest.mark.parametrize("is_glossy", [False, True])
-def test_noiseless_samples_give_back_normals_and_albedos(is_glossy):
-    given, lobes, true, albedo = samples(is_glossy)
-    normals, found, cost = fit_normals(given, lobes, torch.full((PIXELS, PHOTOS), 0.002))
-    assert angles(normals, true).quantile(0.95) < LIT * angles(given.normals, true).median()
-    assert ((found - albedo) / albedo).abs().median() < 0.001 and cost.median() < 1e-3

@@ -22,7 +22,7 @@ from reconstruct.hull.hull_parts import PixelRays, most_needed
 from reconstruct.hull.normal_integration import integrate_within, likeness
 from reconstruct.hull.shadow_hull import shadow_hull
 from reconstruct.initialization import choose_start
-from reconstruct.labels.labels import Labels, assemble_labels
+from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.observer import Observer
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
@@ -143,13 +143,9 @@ def seen():
     """A scene, its truth, the hull with its lid, its exact labels, and lengths of rays: to the hull, to the truth."""
     scene, truth = render(TRAY, Look(n_lights=16))
     lidded = render((LID,), Look(n_lights=16))[1]
-    visible, mask = torch.from_numpy(truth.visibility).float(), torch.from_numpy(truth.mask).float()
-    told = torch.from_numpy(truth.normals).float()
-    albedo = torch.zeros(*mask.shape, 3)
-    labels = Labels(visible, torch.ones_like(visible), mask, torch.ones_like(mask), told, mask, albedo)
     eye = scene.eye.numpy()
     lengths = (np.where(truth.mask, np.linalg.norm(one.points - eye, axis=-1), np.nan) for one in (lidded, truth))
-    return scene, truth, lidded, grid_of((LID,), 2.0), labels, *lengths
+    return scene, truth, lidded, grid_of((LID,), 2.0), truth.labels(), *lengths
 
 
 @pytest.fixture(scope="module")
@@ -216,11 +212,7 @@ def test_the_hull_is_made_anew_behind_the_front(slab_seen):
         for x in (carved, np.minimum(free, speck))
     )
     observer = Observer(scene)
-    mask = torch.from_numpy(truth.mask).float()
-    nothing = torch.zeros(len(scene.lights), *mask.shape)
-    told = torch.from_numpy(truth.normals).float()
-    labels = Labels(nothing, nothing, mask, torch.ones_like(mask), told, mask, torch.zeros(*mask.shape, 3))
-    found = on_front(hull, space, scene, observer.seen(hull), observer.seen(space)[0], labels)
+    found = on_front(hull, space, scene, observer.seen(hull), observer.seen(space)[0], truth.labels(0.0))
     after = resampled(found, NODES).grid()
     inner = binary_erosion(truth.mask, iterations=3)
     off = [np.linalg.norm(observer.seen(g)[0].numpy() - truth.points, axis=-1)[inner] for g in (hull, after)]

@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from reconstruct.hull.follow_normals import follow_normals
 from reconstruct.hull.normal_integration import integrate_behind, integrate_normals, integrate_within
-from reconstruct.labels.labels import Labels, assemble_labels
+from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.outline import local_mean
 from reconstruct.labels.supervision import normal_rays, supervise
@@ -179,12 +179,7 @@ def test_a_grid_follows_the_normals_of_its_labels(block):
     above = torch.maximum(torch.maximum((x.abs() - 1) * 45, (y.abs() - 1) * 30), at[..., 2] - 40 - dome)
     grid = resampled(SdfGrid(torch.minimum(true, above), low, spacing), nodes).grid()
     observer = Observer(replace(scene, mask=torch.from_numpy(truth.mask).float()))
-    height, width = truth.mask.shape
-    nothing = torch.zeros(len(scene.lights), height, width)
-    mask = torch.from_numpy(truth.mask).float()
-    told = torch.from_numpy(truth.normals).float()
-    labels = Labels(nothing, nothing, mask, torch.ones_like(mask), told, mask, torch.zeros(height, width, 3))
-    moved = follow_normals(grid, scene, *observer.seen(grid), labels, integrate_normals)
+    moved = follow_normals(grid, scene, *observer.seen(grid), truth.labels(0.0), integrate_normals)
     top = truth.mask & (truth.normals[..., 2] > 0.9)
     off = [np.abs(observer.seen(g)[0].numpy()[..., 2] - 40)[top].mean() for g in (grid, resampled(moved, nodes).grid())]
     assert off[1] < 0.45 * off[0]

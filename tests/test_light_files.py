@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
+from dataset_folders import write_s3nerf, write_shadowneus, write_shadowneus_real
 from flashlight_photos import CAMERA, POSED_CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights, photograph
+from synthetic import Look, render
 
 from calibration.calibrate_with_file import with_opinions
 from calibration.calibration import Calibration, save_calibration
@@ -16,13 +18,12 @@ from calibration.lights.files import read_lights, read_opinions
 from calibration.lights.layouts import BLENDER
 from calibration.lights.power import SHADING_MISFIT, with_power_per_photo
 from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 
 LIGHTS = handheld_lights(4, np.random.default_rng(0))
 PHOTOS = [light.photo for light in LIGHTS]
 PLACES = np.array([light.position for light in LIGHTS], float)
-ELSEWHERE = Pose(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([3.0, -2.0, 7.0]))  # another world's frame
-UNIT = 0.01  # of that world, in mm
 
 
 def directions() -> np.ndarray:
@@ -49,12 +50,6 @@ def assert_lights(given, kind):
         np.testing.assert_allclose(places(given), PLACES, atol=1e-6)
 
 
-def their_camera(flip: bool) -> np.ndarray:
-    """Our camera in the other world, lengths in its unit; flip: looking along its -z."""
-    pose = ELSEWHERE @ Pose(WORLD_FROM_CAMERA.rotation, WORLD_FROM_CAMERA.translation * UNIT)
-    return pose.matrix() @ np.diag([1.0, -1, -1, 1] if flip else np.ones(4))
-
-
 @pytest.mark.parametrize("decimal", [".", ","])
 def test_an_lp_file_gives_directions_by_name_in_any_order(tmp_path, decimal):
     file = tmp_path / "dome.lp"
@@ -72,44 +67,29 @@ def test_a_dome_gives_places_whatever_its_unit(tmp_path):
     np.testing.assert_allclose(places(read_lights(file, PHOTOS, POSED_CAMERA)), PLACES, atol=1e-6)
 
 
-def test_shadowneus_real_photos_are_placed_by_their_camera_and_floor(tmp_path):
-    poses = np.stack([np.eye(4)] * 4)
-    poses[:, :3, 3] = ELSEWHERE.apply(PLACES * UNIT)
-    file = tmp_path / "params.npz"
-    np.savez(file, light_pose=poses, camera_pose=their_camera(False), floor_height=ELSEWHERE.translation[2])
-    np.testing.assert_allclose(places(read_lights(file, PHOTOS, POSED_CAMERA)), PLACES, atol=1e-6)
-
-
-def test_s3nerf_looks_along_minus_z_and_numbers_its_photos(tmp_path):
-    file = tmp_path / "params.json"
-    lights = np.zeros((9, 3))
-    lights[[1, 3, 4, 8]] = ELSEWHERE.apply(PLACES)
-    pose = (ELSEWHERE @ WORLD_FROM_CAMERA).matrix() @ np.diag([1.0, -1, -1, 1])
-    file.write_text(json.dumps({"light_pos": lights.tolist(), "pose_c2w": pose.tolist()}))
-    photos = ["ld_002.png", "ld_004.png", "ld_005.png", "ld_009.png"]
-    given = read_lights(file, photos, POSED_CAMERA)
-    np.testing.assert_allclose(np.array([x.position for x in given.lights]), PLACES, atol=1e-6)
-
-
-@pytest.mark.parametrize("kind", ["point", "directional"])
-def test_shadowneus_scenes_are_placed_by_their_camera(tmp_path, kind):
-    frames = []
-    for name, place in zip(PHOTOS, PLACES, strict=True):
-        sun = np.eye(4)
-        sun[:3, 3] = ELSEWHERE.apply(place * UNIT)
-        towards = place - POSED_CAMERA.looked_at()
-        sun[:3, 2] = ELSEWHERE.rotate(towards) / np.linalg.norm(towards)
-        camera = their_camera(True).tolist()
-        frames.append(
-            {"file_path": "train/" + Path(name).stem, "transform_matrix": camera, "transform_matrix_sun": sun.tolist()}
-        )
-    floor = np.eye(4)
-    floor[2, 3] = ELSEWHERE.translation[2]
-    (tmp_path / "transforms_floor.json").write_text(json.dumps({"frames": [{"transform_ground": floor.tolist()}]}))
-    file = tmp_path / "transforms_train.json"
-    file.write_text(json.dumps({"light_type": kind, "frames": frames}))
-    given = read_lights(file, PHOTOS, POSED_CAMERA)
-    assert_lights(given, kind)
+@pytest.mark.parametrize(
+    ("kind", "write", "file", "scale"),
+    [
+        ("point", write_shadowneus_real, "params.npz", 3.0),
+        ("point", lambda folder, truth: write_s3nerf(folder, truth, unit=1.0), "params.json", 1.0),  # names no floor
+        ("point", write_shadowneus, "transforms_train.json", 3.0),
+        ("directional", lambda *scene: write_shadowneus(*scene, "directional"), "transforms_train.json", 3.0),
+    ],
+)
+def test_lights_of_a_scene_are_placed_by_its_camera_and_floor(tmp_path, kind, write, file, scale):
+    """Our world is turned and shifted against theirs, and of another unit."""
+    _, truth = render((), Look(width=32, height=24, n_lights=4, kind=kind))
+    write(tmp_path, truth)
+    theirs, turn = truth.calibration.world_from_camera, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    ours = Pose(turn @ theirs.rotation, 3 * turn @ theirs.translation + np.array([3.0, -2.0, 7.0]))
+    photos = sorted({one.name for one in tmp_path.rglob("*[0-9].png")})
+    given = read_lights(tmp_path / file, photos, PosedCamera(truth.calibration.camera, ours, 7.0))
+    for found, true in zip(given.lights, truth.calibration.lights, strict=True):
+        if kind == "directional":
+            expected = turn @ np.array(true.direction)
+        else:
+            expected = ours.apply(scale * theirs.inverse().apply(np.array(true.position)))
+        np.testing.assert_allclose(found.homogeneous()[:3], expected, atol=1e-6)
 
 
 def test_our_own_calibration_comes_back_with_beam_and_power(tmp_path):

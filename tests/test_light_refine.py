@@ -14,16 +14,12 @@ from reconstruct.config import FitConfig, Level
 from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
-from reconstruct.sdf.level_set import LevelSet
 from reconstruct.solve.level import LevelFit
 from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift, unseen_motion
-from reconstruct.solve.ray_operators import cross_entropy
 from reconstruct.solve.trials import judge, try_lights
 from reconstruct.source.source import RunOptions, open_source
-from reconstruct.torch_sdf.ray_field import CompiledRays
 
 RICH = FitConfig(levels=(Level(32, 40, (0.5, 0.4), 3, 5e-4), Level(48, 30, (0.4, 0.1), 2)), votes=1)
-SHARPNESS = 2.0
 
 
 def misplaced(scene, relative: float, seed: int = 5):
@@ -39,40 +35,6 @@ def misplaced(scene, relative: float, seed: int = 5):
     sigma = np.broadcast_to(relative * distance / np.sqrt(3), moved.shape)
     tensors = {"lights": np.concatenate([moved, lights[:, 3:]], 1), "light_sigma": sigma}
     return replace(scene, **{name: torch.from_numpy(np.array(value)).float() for name, value in tensors.items()})
-
-
-def shadow_loss(phi, origins, light, label):
-    """Sum over rays of the loss of shadow rays, voxels, and the gradient it leaves for the light."""
-    rays = CompiledRays(LevelSet(phi, np.zeros(3), 1.0, is_distance=True))
-    lights = torch.tensor([[*light, 0.0]], dtype=torch.float64, requires_grad=True)
-    many = lights.expand(len(origins), 5)
-    seen, least = rays.march(torch.from_numpy(origins), many, SHARPNESS, torch.ones(len(origins), dtype=torch.float64))
-    target = torch.full_like(seen, float(label))
-    loss = cross_entropy(seen.exp(), -seen.expm1(), target).sum() / SHARPNESS + (1 - label) * least.sum()
-    loss.backward()
-    assert lights.grad is not None
-    return float(loss.detach()), lights.grad[0, [0, 1, 2, 4]].numpy()
-
-
-@pytest.mark.parametrize("light", [(40.0, 12.0, 70.0, 1.0), (0.48, 0.0, 0.8772, 0.0)])
-def test_the_light_gradient_is_the_derivative_of_the_loss(light):
-    x = np.stack(np.meshgrid(*[np.arange(40.0)] * 3, indexing="ij"), -1)
-    phi = (np.linalg.norm(x - [20, 20, 20], axis=-1) - 8).astype(np.float32)
-    light, rng = np.array(light), np.random.default_rng(0)
-    towards = light[:3] - light[3] * np.full(3, 20)
-    towards /= np.linalg.norm(towards)
-    side = np.linalg.svd(towards[None])[2][1:]
-    around = rng.standard_normal((200, 2))
-    around *= (8 + rng.uniform(-0.4, 0.4, (200, 1))) / np.linalg.norm(around, axis=1, keepdims=True)
-    origins = np.array([20, 20, 20]) + around @ side - 14 * towards  # rays that graze the ball
-    for axis in side:
-        step = np.append(axis, 0) * (0.05 if light[3] else 0.002)
-        for label in (0, 1):
-            up, down = (shadow_loss(phi, origins, light + sign * step, label)[0] for sign in (1, -1))
-            slope = (up - down) / (2 * np.linalg.norm(step))
-            _, left = shadow_loss(phi, origins, light, label)
-            # The sum over the ring nearly cancels; what is left is compared with the size of its parts.
-            assert abs(left[:3] @ axis - slope) < 0.02 * left[3], (label, left[:3] @ axis, slope)
 
 
 def test_a_homology_about_the_eye_keeps_what_is_in_line():

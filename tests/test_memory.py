@@ -1,8 +1,6 @@
 """The memory that a run will take is said beforehand, and is what such runs took."""
 
-import json
 import resource
-from dataclasses import asdict
 from pathlib import Path
 
 import psutil
@@ -13,7 +11,6 @@ from synthetic import BALL, Look, render
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import load_calibration
 from calibration.known_scene import KnownScene
-from capture.files.atomic import write_json
 from capture.files.schema import read_kept
 from reconstruct.run import pipeline
 from reconstruct.run_folder import forecast
@@ -53,15 +50,6 @@ def test_photos_go_first_then_pixels_then_photos_again_and_the_sentence_says_so(
     tiny = plan_for(300, 4032, 3024, "standard", 1e9)
     assert (tiny.photos, tiny.long_side) == (40, 320) and "may run out of it" in tiny.sentence
     assert "may run out of it" in plan_for(20, 320, 240, "draft", 1e8).sentence
-
-
-def test_a_plan_is_read_as_it_was_written_and_what_is_none_is_not(tmp_path):
-    plan = plan_for(300, 4032, 3024, "standard", 4e9)
-    write_json(tmp_path / "memory.json", asdict(plan))
-    assert read_kept(tmp_path / "memory.json", Plan) == plan
-    for content in ("", "[]", '{"photos": 3}', json.dumps(asdict(plan) | {"photos": -1}), "[" * 99999):
-        (tmp_path / "memory.json").write_text(content)
-        assert read_kept(tmp_path / "memory.json", Plan) is None
 
 
 def test_a_run_may_hold_what_is_free_and_no_more_than_its_limits(tmp_path, monkeypatch):

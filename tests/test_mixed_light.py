@@ -81,7 +81,6 @@ def test_a_flashlight_that_changes_its_power_is_told_from_which_photo_on(lights)
 
 @pytest.fixture
 def calibrated(monkeypatch):
-    """Calibrate photos whose camera is known."""
     residuals = {"board": "checkerboard:9x6:20", "notes": [], "pose_covariance": np.zeros((6, 6)).tolist()}
     sheet = SimpleNamespace(on_sheet=lambda corners: corners)
     monkeypatch.setattr(glue, "fit_board", lambda *_: (POSED_CAMERA, sheet, residuals))

@@ -29,10 +29,8 @@ pytestmark = pytest.mark.slow  # rendering takes half a minute
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory):
+def capture(renderer, tmp_path_factory):
     """Three views and an object pose; in the second view the tripod was pushed for one photo."""
-    for name in ("mitsuba", "embreex"):
-        pytest.importorskip(name, reason=f"{name} is not installed: pip install 'shadowgraph[generator]'")
     from examples.generator.capturing import make_capture
 
     out = tmp_path_factory.mktemp("captures") / "boxes"

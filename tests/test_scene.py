@@ -10,7 +10,7 @@ from synthetic import BALL, Look, render
 from calibration.light import Light
 from calibration.light import irradiance as irradiance_by_calibration
 from capture.errors import ReconstructionError
-from reconstruct.scene import build_scene, irradiance, lights_in_frame, reduced
+from reconstruct.scene import build_scene, irradiance, reduced
 
 SMALL = Look(width=60, height=44, n_lights=5)
 
@@ -66,14 +66,3 @@ def test_a_reduced_scene_looks_through_the_middle_of_the_pixels_it_joins():
     cosine = (half.directions * quads / quads.norm(dim=-1, keepdim=True)).sum(-1)
     assert cosine.min() > 1 - 1e-6  # 0.08 degrees, a tenth of a pixel
     assert half.pixel_angle == pytest.approx(2 * scene.pixel_angle)
-
-
-def test_in_another_frame_points_see_their_lights_where_they_saw_them():
-    origin, scale = torch.tensor([3.0, -1.0, 2.0]), 4.0
-    lights = torch.tensor([[11.0, 7.0, 30.0, 1.0], [0.6, 0.0, 0.8, 0.0]])
-    found, point = lights_in_frame(lights, origin, scale), torch.tensor([1.0, 2.0, 3.0])
-    here = (point - origin) / scale
-    torch.testing.assert_close(scale * (found[0, :3] - here), lights[0, :3] - point)
-    torch.testing.assert_close(found[1], lights[1], rtol=0, atol=0)
-    exact = lights_in_frame(lights.double(), origin.double(), 0.1)[0, :3].numpy()
-    assert np.array_equal(exact, (lights[0, :3].double() - origin.double()).numpy() / 0.1)

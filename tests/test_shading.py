@@ -56,6 +56,7 @@ def test_positions_are_found_to_half_a_per_cent_despite_object_shadows_and_textu
     assert all(light.used for light in found.lights)
 
 
+@pytest.mark.usefixtures("few_starts")
 @pytest.mark.parametrize(("near", "reach"), [(0.24, (380, 850)), (2.2, (250, 700))])
 def test_lights_are_found_wherever_the_camera_stands(near, reach, monkeypatch):
     """From a coin seen from 150 mm to a chair seen from 1.4 m: a hand holds the light as far away as ever.

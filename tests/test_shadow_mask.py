@@ -26,8 +26,7 @@ LOOK = Look(width=160, height=120, n_lights=24, with_shadow=True)
 def found(scene, truth) -> float:
     mask = with_object_mask(replace(scene, rgb=None)).mask
     assert mask is not None
-    found = mask.numpy() > 0.5
-    return (found & truth.mask).sum() / (found | truth.mask).sum()
+    return truth.overlap(mask)
 
 
 @pytest.mark.parametrize("kind", ["point", "directional"])

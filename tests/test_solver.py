@@ -25,8 +25,6 @@ SMALL = FitConfig(levels=(Level(24, 30, (0.5, 0.4), 3, 5e-4), Level(40, 30, (0.4
 
 
 class Listener:
-    """A SolveReporter that remembers."""
-
     def __init__(self):
         self.lines = []
 
@@ -95,7 +93,6 @@ def test_the_true_surface_is_left_alone_by_its_own_shadows():
 
 
 def ball(grow: float = 0.0) -> SdfGrid:
-    """The ball grown by so many mm."""
     return grid_of((replace(BALL, radius=BALL.radius + grow),), 3.0)
 
 

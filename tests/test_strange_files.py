@@ -22,6 +22,7 @@ from dataset_folders import (
     write_shadowneus,
     write_shadowneus_real,
 )
+from fuzz_images import DAMAGES
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from synthetic import BALL, Look, default_camera, render
@@ -58,24 +59,12 @@ def scenes(tmp_path_factory) -> dict[str, Path]:
 
 
 def mutated(data: bytes, seed: int) -> bytes:
-    """The bytes of a file with something wrong: cut, bits turned, a part gone or doubled, a word or number replaced."""
-    rng = random.Random(seed)
-    at = rng.randrange(len(data) + 1)
-    length = rng.choice((1, 2, 8, 64, 500))
-    kind = rng.randrange(6)
-    if kind == 0:
-        return data[:at]
-    if kind == 1:
-        return data[:at] + data[at + length :]
-    if kind == 2:
-        return data[:at] + data[at : at + length] * 3 + data[at + length :]
-    if kind == 3:
-        out = bytearray(data)
-        for _ in range(rng.choice((1, 3, 30))):
-            out[rng.randrange(len(out))] = rng.randrange(256)
-        return bytes(out)
-    words = data.split(b" ") if b" " in data else [data[:at], data[at:]]
-    words[rng.randrange(len(words))] = rng.choice(SPITEFUL)
+    """The bytes of a file with something wrong: damaged as pictures are, or a word or number replaced."""
+    draw = random.Random(seed)
+    if draw.random() < 0.67:
+        return draw.choice(DAMAGES)(draw, data)
+    words = data.split(b" ") if b" " in data else [data[: len(data) // 2], data[len(data) // 2 :]]
+    words[draw.randrange(len(words))] = draw.choice(SPITEFUL)
     return b" ".join(words)
 
 

@@ -43,7 +43,6 @@ def random_ends(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cosine(found: np.ndarray, expected: np.ndarray) -> float:
-    """Between two arrays as vectors."""
     return float((found * expected).sum() / np.linalg.norm(found) / np.linalg.norm(expected))
 
 
@@ -75,20 +74,17 @@ def test_marching_and_scattering_are_the_kernels(sharpness):
 
 @pytest.fixture(scope="module")
 def shadows() -> Scene:
-    """The shadow pictures of a ball."""
     scene, _ = render((BALL,), Look(width=60, height=45, with_shadow=True, with_mask=True, n_lights=8))
     return replace(scene, rgb=None)
 
 
 @pytest.fixture(scope="module")
 def by_kernels(shadows) -> SdfGrid:
-    """The surface of a solve by the kernels."""
     return fit(shadows, SMALL, lambda **_: None).grid
 
 
 @pytest.fixture(scope="module")
 def by_torch(shadows) -> SdfGrid:
-    """The surface of a solve by torch."""
     return fit(shadows, SMALL, lambda **_: None, device=TORCH).grid
 
 
