@@ -27,7 +27,6 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import carried
 from reconstruct.tensor_file import Layout, parsed, read_tensors, refuse_outside, write_tensors
 
-SIGMAS = 1.64  # of its noise by which the held-out error must fall: chance alone does that once in twenty times
 FORMAT = "1"
 MAKE = "make the result again, or ask for the file again."
 MOST_NODES = 400**3  # of a grid: a mesh of more does not fit in memory
@@ -54,28 +53,6 @@ LAYOUTS |= {
 LAYOUTS |= {
     f"{MOTION}_{number}": replace(LAYOUTS["world_from_camera"], is_needed=False) for number in range(1, MOST_VIEWS)
 }
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Mean |T - label| of held-out shadow rays, with the surface settled under either set of lights."""
-
-    calibrated: Number
-    refined: Number
-    noise: Number  # one sigma of the difference, from how it varies between photos
-
-    @property
-    def is_accepted(self) -> bool:
-        """Whether the refined lights explain held-out shadows better, by more than noise."""
-        return self.calibrated - self.refined > SIGMAS * self.noise
-
-    def sentence(self) -> str:
-        """State the decision and its numbers."""
-        numbers = (
-            f"of shadows that were set aside for a test, {100 * self.refined:.3g} % are wrong with them, "
-            f"{100 * self.calibrated:.3g} % without, and {100 * self.noise:.2g} % by chance"
-        )
-        return f"moved lights are {'' if self.is_accepted else 'not '}kept: {numbers}"
 
 
 @dataclass(frozen=True)
@@ -133,7 +110,6 @@ class SolvedScene:
     lights: Float[Tensor, "photos 4"] | None = None  # homogeneous, where the solve left them; as Scene.photo_names
     gloss: Gloss | None = None  # on the same pixels as albedo; None: matt
     evidence: Float[Tensor, "nx ny nz"] | None = None  # rays whose edge passes each node, see evidence.ray_counts
-    light_trial: Verdict | None = None  # on lights that moved; None: none did
     doubts: tuple[str, ...] = ()  # warnings for the user about photos and lights that contradict each other
     interreflection: float = 0.0  # true albedo over `albedo`, by the light that surfaces send each other; 0: none seen
     view: str = ""  # name of the camera's view, where there are several
@@ -234,7 +210,6 @@ def save_fields(fields: SolvedScene, path: Path) -> None:
         "camera": asdict(fields.camera),
         "ground_height": fields.ground_height,
         "unit": fields.unit,
-        "light_trial": None if fields.light_trial is None else asdict(fields.light_trial),
         "doubts": fields.doubts,
         "interreflection": fields.interreflection,
         "light_share": fields.light_share,
@@ -255,7 +230,6 @@ class _Header(_ViewHeader, kw_only=True):
     spacing: Annotated[float, Meta(ge=1 / LARGEST_LENGTH, le=LARGEST_LENGTH)]
     ground_height: Length
     unit: Literal["mm", "scene"]
-    light_trial: Verdict | None = None
     doubts: tuple[Text, ...] = ()
     interreflection: Number = 0.0
     light_share: Number = 0.0
@@ -308,7 +282,6 @@ def _checked(tensors: Mapping[str, Tensor], rest: _Header) -> SolvedScene:
         first.lights,
         gloss,
         tensors["evidence"].float() if "evidence" in tensors else None,
-        rest.light_trial,
         rest.doubts,
         rest.interreflection,
         rest.view,

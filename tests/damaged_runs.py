@@ -28,7 +28,7 @@ from calibration.side_view import SideView
 from reconstruct.appearance.brdf import LOBES, Gloss
 from reconstruct.detail.file import DETAIL, Detail, save_details
 from reconstruct.detail.surface import Window
-from reconstruct.fields import FurtherView, SolvedScene, Verdict, load_fields, save_fields
+from reconstruct.fields import FurtherView, SolvedScene, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
 from reconstruct.solve.checkpoint import write_checkpoint
 from viewer.stage.page import write_stage
@@ -67,10 +67,6 @@ def make(folder: Path, has_stage: bool = True) -> Path:
     state = json.dumps({"iteration": 0, "spacing": fields.grid.spacing})
     tensors = {"start": fields.grid.values.contiguous(), "origin": fields.grid.origin}
     write_checkpoint(tensors, {"format": "6", "fingerprint": "x", "state": state}, run / "checkpoint.safetensors")
-    report = json.loads((run / "report.json").read_text())
-    rows = [{"photo": "p.jpg", "position": [1.0, 2, 300], "moved": 1.0, "sigma": [1.0, 1, 1], "sigmas": 1.0}]
-    trial = {"accepted": True, "sentence": "refined lights accepted", "calibrated": 0.1, "refined": 0.05, "noise": 0.01}
-    _write(run / "report.json", report | {"refined_lights": rows, "light_trial": trial})
     calibration = fake_run.calibration_of(truth)
     told = {"notes": ["a note"], "shading_rms_by_photo": {light.photo: 0.01 for light in calibration.lights}}
     save_calibration(replace(calibration, residuals=calibration.residuals | told), run / "calibration.json")
@@ -125,7 +121,6 @@ def _all_known(fields: SolvedScene, n_lights: int) -> SolvedScene:
         lights=torch.ones(n_lights - 1, 4),
         gloss=Gloss(torch.full((1, LOBES, 3), 0.01), weights),
         evidence=torch.full(fields.grid.values.shape, 3.0),
-        light_trial=Verdict(0.1, 0.05, 0.01),
     )
 
 

@@ -19,11 +19,11 @@ from reconstruct.object_poses import alignment
 from reconstruct.object_poses import confirmed as confirmation
 from reconstruct.object_poses.alignment import Alignment, SeenSurface, align, angle_between, mean_difference, stepped
 from reconstruct.object_poses.confirmed import Met, confirmed, how_met, withheld
+from reconstruct.object_poses.light_motions import MODES, LightMotions, unseen_motion
 from reconstruct.object_poses.motion_refine import MotionTrial, ObjectPoseRays, compare, refined_motion
 from reconstruct.object_poses.together import PlacedObjectPose, SolvedObjectPose, Together, lay_together, merged_surface
 from reconstruct.render.g_buffer import seen_material
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.solve.light_refine import MovingLights, no_shift
 from reconstruct.views import placed
 
 COLOUR = (0.7, 0.5, 0.3)
@@ -146,16 +146,27 @@ def test_a_placed_scene_meets_the_surface_as_the_scene_does_in_its_own_world(lai
     assert errors[0].mean() < 0.1 and np.abs(errors[0] - errors[1]).mean() < 0.02
 
 
-def test_lights_of_another_object_pose_move_in_its_own_world(laid):
-    scene, motion = laid
-    there = replace(scene, object_from_world=motion)
-    own, moved = (MovingLights((one,), no_shift((one,))) for one in (scene, there))
-    np.testing.assert_allclose(moved.in_grid(np.zeros(3), 1.0)[:, :3], placed(there).lights[:, :3].numpy(), atol=1e-3)
-    gradient = np.random.default_rng(0).standard_normal((len(scene.lights), 4)) ** 2
-    turned = np.concatenate([motion.rotate(gradient[:, :3]), gradient[:, 3:]], 1)
-    own.follow(gradient, 0.5, 20)
-    moved.follow(turned, 0.5, 20)
-    np.testing.assert_allclose(moved.shift.shift, own.shift.shift, atol=1e-9)
+def test_a_homology_about_the_eye_keeps_what_is_in_line():
+    scene, _ = render((SHAPES[0],), Look(n_lights=6))
+    scene = replace(scene, light_sigma=torch.ones(6, 3))
+    eye, lights = scene.eye.double().numpy(), scene.lights.double().numpy()[:, :3]
+    small = 1e-9  # moves the lights by some 1e-4 mm
+    moved = lights + small * unseen_motion(scene)
+    for light, light_moved in zip(lights, moved, strict=True):
+        foot = np.array([30.0, -20.0, 0.0])
+        blocker = foot + 0.2 * (light - foot)
+        blocker_moved = blocker + small * blocker[2] * (eye - blocker)
+        away = np.cross(blocker_moved - foot, light_moved - foot)
+        alone = np.cross(blocker - foot, light_moved - foot)
+        assert np.linalg.norm(away) < 1e-3 * np.linalg.norm(alone)  # of second order
+
+
+def test_a_direction_that_is_moved_stays_a_unit_vector():
+    scene, _ = render(SHAPES, Look(n_lights=4, kind="directional"))
+    scene = replace(scene, light_sigma=torch.full((4, 3), 0.02))
+    turned = LightMotions(scene, np.zeros(3), np.ones(MODES)).scene()
+    torch.testing.assert_close(turned.lights.norm(dim=1), torch.ones(4))
+    assert (turned.lights != scene.lights).any(1).all()
 
 
 def test_a_motion_a_little_off_is_refined_on_rays_and_held_out_rays_agree(laid, own_rays):

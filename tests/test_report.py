@@ -20,7 +20,6 @@ from reconstruct.sdf.grid import SdfGrid
 from shadowgraph.run_result import RunResult
 from viewer.report.document import difference_picture, mesh_picture, normal_picture, reduced
 from viewer.report.figures import curves, lights_from_above
-from viewer.report.numbers import refinement_part
 from viewer.report.pictures import computed_picture, guess_facts, is_shadow_picture, mesh_pictures
 from viewer.report.report import write_report
 
@@ -240,13 +239,6 @@ def test_each_picture_of_the_mesh_says_how_much_of_what_it_shows_is_known():
     assert 40 < right[1] < 90 and sum(right) < 100
     del ball.vertex_attributes["evidence"]
     assert "seen in the photos" not in mesh_pictures(ball, None)
-
-
-def test_the_report_tells_how_far_lights_moved_and_why_that_was_kept():
-    trial = {"accepted": True, "sentence": "refined lights decided upon", "noise": 0.1}
-    page = refinement_part({"refined_lights": [{"sigmas": by} for by in (1, 2, 3, 4)], "light_trial": trial})
-    assert "Refined lights decided upon." in page and "less than 2.50 times" in page
-    assert "times" not in refinement_part({"light_trial": trial | {"accepted": False}})
 
 
 # --- a finished run as a Python object -------------------------------------------------------------------------------

@@ -44,7 +44,6 @@ def summary(
 ) -> dict[str, Any]:
     """Return the content of report.json: costs, photos used and dropped, residuals, versions."""
     calibration, check, plan = calibrated.first, run.file(CHECK), read_kept(run.file(PLAN), Plan)
-    residuals, trial = plain(calibration.residuals), solved.light_trial
     views = {view.name: view.calibration for view in calibrated.every()}
     notes, warnings = (_said(calibrated, key) for key in ("notes", "warnings"))
     names = {calibrated.views[0].name, *(view.view for view in solved.views())}
@@ -74,15 +73,13 @@ def summary(
             for name, one in views.items()
             for row in _photos(one, name if len(views) > 1 else "", len(views) == 1 or name in names)
         ],
-        "calibration": residuals,
+        "calibration": plain(calibration.residuals),
         **_of_views(calibrated, solved),
         "assumptions": plain(notes),
         "verdict": in_one_sentence(grade, warnings),
         "grade": grade,
         "warnings": warnings,
         "fit": fit,
-        "refined_lights": plain(_refined_lights(calibration, solved)),
-        "light_trial": trial and {"accepted": trial.is_accepted, "sentence": trial.sentence()} | asdict(trial),
         "mesh": {
             "size": mesh.extents.tolist(),
             "faces": len(mesh.faces),
@@ -147,7 +144,6 @@ def _of_views(calibrated: CalibratedViews, solved: SolvedScene) -> dict[str, Any
     for view in every:
         row: dict[str, Any] = {"name": view.name, "calibration": view.calibration.residuals}
         if view.name in found:
-            row["refined_lights"] = _refined_lights(view.calibration, found[view.name])
             motion = found[view.name].object_from_world
             if motion is not None:
                 row["object_from_world"] = motion.matrix()
@@ -195,24 +191,6 @@ def _requests(run: RunFolder) -> list[str]:
     last = max((i for i, line in enumerate(lines) if line.get("numbers")), default=-1)
     said = [(i, str(line["message"])) for i, line in enumerate(lines) if ON_REQUEST in str(line.get("message"))]
     return [text for i, text in said if i > last or "goes on from here" not in text]
-
-
-def _refined_lights(calibration: Calibration, solved: SolvedScene) -> list[dict[str, Any]]:
-    """Return each uncertain light after the solve, and its distance from its calibrated position or direction.
-
-    `moved` is in units of the calibration (radians for a direction); `sigmas` is `moved` over the norm of `sigma`.
-    """
-    if solved.lights is None:
-        return []
-    rows = []
-    lights = [light for light in calibration.lights if light.used]
-    for light, now in zip(lights, solved.lights.double().numpy(), strict=True):
-        by = float(np.linalg.norm(now[:3] - light.homogeneous()[:3]))
-        if light.sigma.any():
-            key = "direction" if light.position is None else "position"
-            row = {"photo": light.photo, key: now[:3], "moved": by, "sigma": light.sigma}
-            rows.append(row | {"sigmas": by / float(np.linalg.norm(light.sigma))})
-    return rows
 
 
 def misfit(numbers: dict[str, float]) -> list[str]:
