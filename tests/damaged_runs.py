@@ -47,12 +47,11 @@ SPARSE = 8 << 30  # bytes that a file says it has
 
 def make(folder: Path, has_stage: bool = True) -> Path:
     """A finished run with every file that one may hold."""
-    n_lights = 6
-    truth = fake_run.make_truth(64, n_lights)
+    truth = fake_run.make_truth(64, 6)
     run = folder / "heap"
     fake_run.start_run(run, truth)
     fake_run.finish_run(run, truth)
-    fields = _all_known(fake_run.fields_of(truth), n_lights)
+    fields = _all_known(fake_run.fields_of(truth))
     save_fields(fields, run / "fields.safetensors")
     save_mesh(extract_mesh(fields), run / "mesh.ply", run / "mesh.glb", "mm")
     (run / "hull.ply").write_bytes((run / "preview.ply").read_bytes())
@@ -91,7 +90,7 @@ def make_several(folder: Path) -> Path:
     fields = load_fields(run / "fields.safetensors")
     poses = {"view_2": (own.world_from_camera, None), "turned_1": (object_pose.first.world_from_camera, motion)}
     further = tuple(
-        FurtherView(name, fields.albedo, fields.camera, pose, torch.ones(5, 4), object_from_world=moved)
+        FurtherView(name, fields.albedo, fields.camera, pose, object_from_world=moved)
         for name, (pose, moved) in poses.items()
     )
     fields = replace(fields, view="view_1", further=further, gloss=None, light_share=0.01)
@@ -113,12 +112,11 @@ def _side_view(own: Calibration) -> SideView:
     return SideView("side.jpg", own.posed_camera, (4, 4, 32, 24), mask, np.ones_like(mask), 1.0)
 
 
-def _all_known(fields: SolvedScene, n_lights: int) -> SolvedScene:
+def _all_known(fields: SolvedScene) -> SolvedScene:
     height, width = fields.albedo.shape[:2]
     weights = torch.full((height, width, 1), 0.1)
     return replace(
         fields,
-        lights=torch.ones(n_lights - 1, 4),
         gloss=Gloss(torch.full((1, LOBES, 3), 0.01), weights),
         evidence=torch.full(fields.grid.values.shape, 3.0),
     )

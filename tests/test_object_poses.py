@@ -224,7 +224,7 @@ def test_a_solved_scene_of_two_object_poses_equals_its_file_and_knows_both_world
     albedo = torch.full((48, 64, 3), 0.5)
     place = (first.camera, first.world_from_camera, 0.0, "mm")
     grid, gloss = grid_of(SHAPES, 2.5), Gloss(torch.full((1, LOBES, 3), 0.25), torch.ones(48, 64, 1))
-    other = (scene.camera, scene.world_from_camera, scene.lights, torch.ones(48, 64, 1), motion)
+    other = (scene.camera, scene.world_from_camera, torch.ones(48, 64, 1), motion)
     there = FurtherView("turned_1", albedo, *other)
     more = {"gloss": gloss, "evidence": torch.full_like(grid.values, 3.0), "light_share": 0.03}
     fields = SolvedScene(grid, albedo, *place, further=(there,), **more)

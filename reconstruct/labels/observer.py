@@ -166,7 +166,7 @@ class Observer:
     ) -> SolvedScene:
         surface = surface if self._relief is None else cut_at_relief(surface, self._relief)
         camera = (scene.camera, scene.world_from_camera)
-        rest = (scene.ground_height, scene.unit, scene.lights, gloss)
+        rest = (scene.ground_height, scene.unit, gloss)
         middle = surface.origin.double().numpy() + 0.5 * surface.spacing * (np.array(surface.values.shape) - 1)
         return SolvedScene(
             surface,

@@ -47,12 +47,13 @@ def summary(
     views = {view.name: view.calibration for view in calibrated.every()}
     notes, warnings = (_said(calibrated, key) for key in ("notes", "warnings"))
     names = {calibrated.views[0].name, *(view.view for view in solved.views())}
+    lights = sum(x.used for name, one in views.items() if name in names for x in one.lights)
     after = [
         *plain(warnings),
         *(reason for _, reason in calibrated.left_out),
         *([plan.sentence] if plan and OVERRIDE in plan.sentence else []),
         *solved.doubts,
-        *pieces(mesh, solved),
+        *pieces(mesh, solved, lights),
         *guessed(mesh),
         *undersides(mesh, solved),
         *_requests(run),
@@ -213,8 +214,12 @@ def misfit(numbers: dict[str, float]) -> list[str]:
     return found
 
 
-def pieces(mesh: trimesh.Trimesh, solved: SolvedScene) -> list[str]:
-    """Return a warning if the mesh falls into pieces that hang in the air; without ground, into pieces at all."""
+def pieces(mesh: trimesh.Trimesh, solved: SolvedScene, lights: int) -> list[str]:
+    """Return a warning if the mesh falls into pieces that hang in the air; without ground, into pieces at all.
+
+    Args:
+        lights: how many were used.
+    """
     parts = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)))
     if len(parts) < 2:
         return []
@@ -223,11 +228,9 @@ def pieces(mesh: trimesh.Trimesh, solved: SolvedScene) -> list[str]:
     in_the_air = lows > solved.ground_height + IN_THE_AIR * solved.grid.spacing
     if not in_the_air.any() or (in_the_air.all() and areas.max() >= LARGEST_PART * areas.sum()):
         return []
-    lights = [view.lights for view in solved.views() if view.lights is not None]
-    count = sum(map(len, lights))
     why = (
-        f"{count} photos leave open how far away some parts are. A few more, lit from other sides, would tell."
-        if lights and count < FEW_LIGHTS
+        f"{lights} photos leave open how far away some parts are. A few more, lit from other sides, would tell."
+        if lights < FEW_LIGHTS
         else "shadows that contradict each other carve an object into crumbs. Look at the lights in report.html."
     )
     return [f"the mesh falls into {len(parts)} pieces, {in_the_air.sum()} of them in the air: {why}"]
