@@ -33,7 +33,7 @@ class Dataset:
     """One picture per light, in order. World frame and unit of the run."""
 
     run: StoredRun
-    lights: tuple[Light, ...]  # those that were used, where the solve left them; `photo` is the capture's file name
+    lights: tuple[Light, ...]  # those that were used; `photo` is the capture's file name
     camera: Camera  # of the pictures
     photos: tuple[Path, ...] | None  # the capture's; None: the surface is relit
     calibration: Calibration  # of the view
