@@ -81,7 +81,7 @@ def compare_level(scene: Scene, device: torch.device, config: FitConfig, nodes: 
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
     for surface, shoot in ((kernel, by_kernels), (moving, by_torch)):
-        shoot.look(surface.grid(), scene, 0, SHARPNESS, 0.5)
+        shoot.look(surface.grid(), 0, SHARPNESS, 0.5)
         shoot(0, SHARPNESS)
     expected = kernel.sums()[0]
     apart = np.linalg.norm(moving.sums()[0] - expected) / np.linalg.norm(expected)

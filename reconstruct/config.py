@@ -36,5 +36,4 @@ class FitConfig:
     votes: int | None = None  # lights that must prove a node empty for the hull; None: by the kind of labels
     use_boundary: bool = True
     use_start_gradient: bool = True
-    refine_lights: bool = True  # lights that the scene calls uncertain move with the surface
     supervised: str = "both"  # "both" | "foreground" | "background": whose shadow rays count, see restricted

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from msgspec import Meta, Struct
 from torch import Tensor
 
-from calibration.calibration import LARGEST_LENGTH, MOST_LIGHTS, Length, is_rigid
+from calibration.calibration import LARGEST_LENGTH, Length, is_rigid
 from calibration.camera import Camera
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
@@ -27,7 +27,6 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import carried
 from reconstruct.tensor_file import Layout, parsed, read_tensors, refuse_outside, write_tensors
 
-SIGMAS = 1.64  # of its noise by which the held-out error must fall: chance alone does that once in twenty times
 FORMAT = "1"
 MAKE = "make the result again, or ask for the file again."
 MOST_NODES = 400**3  # of a grid: a mesh of more does not fit in memory
@@ -41,12 +40,12 @@ LAYOUTS = {
     "origin": Layout(torch.float32, (3,)),
     "albedo": Layout(torch.float16, (None, None, 3)),
     "world_from_camera": Layout(torch.float64, (4, 4)),
-    "lights": Layout(torch.float32, (None, 4), is_needed=False),
+    "lights": Layout(torch.float32, (None, 4), is_needed=False),  # of older files; not read: the calibration has them
     "evidence": Layout(torch.float16, (None, None, None), is_needed=False),
     "lobes": Layout(torch.float32, (None, LOBES, 3), is_needed=False),
     "lobe_weights": Layout(torch.float16, (None, None, None), is_needed=False),
 }
-OF_A_VIEW = ("albedo", "world_from_camera", "lights", "lobe_weights")  # of a further camera: with its number, albedo_1
+OF_A_VIEW = ("albedo", "world_from_camera", "lobe_weights", "lights")  # of a further camera: with its number, albedo_1
 MOTION = "object_from_world"  # of a further camera of another object pose, with its number
 LAYOUTS |= {
     f"{name}_{number}": replace(LAYOUTS[name], is_needed=False) for number in range(1, MOST_VIEWS) for name in OF_A_VIEW
@@ -57,28 +56,6 @@ LAYOUTS |= {
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """Mean |T - label| of held-out shadow rays, with the surface settled under either set of lights."""
-
-    calibrated: Number
-    refined: Number
-    noise: Number  # one sigma of the difference, from how it varies between photos
-
-    @property
-    def is_accepted(self) -> bool:
-        """Whether the refined lights explain held-out shadows better, by more than noise."""
-        return self.calibrated - self.refined > SIGMAS * self.noise
-
-    def sentence(self) -> str:
-        """State the decision and its numbers."""
-        numbers = (
-            f"of shadows that were set aside for a test, {100 * self.refined:.3g} % are wrong with them, "
-            f"{100 * self.calibrated:.3g} % without, and {100 * self.noise:.2g} % by chance"
-        )
-        return f"moved lights are {'' if self.is_accepted else 'not '}kept: {numbers}"
-
-
-@dataclass(frozen=True)
 class FurtherView:
     """What another camera of the same solve saw, as in SolvedScene."""
 
@@ -86,19 +63,15 @@ class FurtherView:
     albedo: Float[Tensor, "height width 3"]
     camera: Camera
     world_from_camera: Pose
-    lights: Float[Tensor, "photos 4"] | None = None
     gloss_weights: Float[Tensor, "height width materials"] | None = None  # of the lobes of SolvedScene.gloss
-    object_from_world: Pose | None = None  # of another object pose: camera and lights are in its own world
+    object_from_world: Pose | None = None  # of another object pose: the camera is in its own world
 
     def scaled(self, factor: float) -> "FurtherView":
         """Return the same view in a unit of which `factor` are one of this one's."""
-        lights, motion = self.lights, self.object_from_world
-        if lights is not None:
-            is_point = lights[:, 3:] > 0
-            lights = torch.cat([torch.where(is_point, factor * lights[:, :3], lights[:, :3]), lights[:, 3:]], 1)
+        motion = self.object_from_world
         pose = Pose(self.world_from_camera.rotation, factor * self.world_from_camera.translation)
         motion = None if motion is None else Pose(motion.rotation, factor * motion.translation)
-        return replace(self, world_from_camera=pose, lights=lights, object_from_world=motion)
+        return replace(self, world_from_camera=pose, object_from_world=motion)
 
     def as_stored(self) -> "FurtherView":
         """Round to the precision of the file."""
@@ -110,7 +83,6 @@ class FurtherView:
         found = {
             "albedo": _half(self.albedo),
             "world_from_camera": torch.from_numpy(self.world_from_camera.matrix()),
-            "lights": self.lights,
             "lobe_weights": None if self.gloss_weights is None else _half(self.gloss_weights),
             MOTION: None if self.object_from_world is None else torch.from_numpy(self.object_from_world.matrix()),
         }
@@ -130,10 +102,8 @@ class SolvedScene:
     world_from_camera: Pose
     ground_height: float
     unit: str  # "mm" | "scene"
-    lights: Float[Tensor, "photos 4"] | None = None  # homogeneous, where the solve left them; as Scene.photo_names
     gloss: Gloss | None = None  # on the same pixels as albedo; None: matt
     evidence: Float[Tensor, "nx ny nz"] | None = None  # rays whose edge passes each node, see evidence.ray_counts
-    light_trial: Verdict | None = None  # on lights that moved; None: none did
     doubts: tuple[str, ...] = ()  # warnings for the user about photos and lights that contradict each other
     interreflection: float = 0.0  # true albedo over `albedo`, by the light that surfaces send each other; 0: none seen
     view: str = ""  # name of the camera's view, where there are several
@@ -155,7 +125,7 @@ class SolvedScene:
         return points if self.object_from_world is None else self.object_from_world.apply(points)
 
     def views(self) -> "tuple[SolvedScene, ...]":
-        """Return the scene as each of its cameras saw it: each one's albedo, gloss and lights, without the others'.
+        """Return the scene as each of its cameras saw it: each one's albedo and gloss, without the others'.
 
         Where the object was laid anew, its surface is carried into that pose's world, in which the ground is level.
         """
@@ -180,7 +150,7 @@ class SolvedScene:
         """What each camera saw, the first one's at first."""
         weights = None if self.gloss is None else self.gloss.weights
         pose, motion = self.world_from_camera, self.object_from_world
-        return (FurtherView(self.view, self.albedo, self.camera, pose, self.lights, weights, motion), *self.further)
+        return (FurtherView(self.view, self.albedo, self.camera, pose, weights, motion), *self.further)
 
     def of_cameras(self, first: FurtherView, *further: FurtherView) -> "SolvedScene":
         """Return the scene as these cameras saw it."""
@@ -190,7 +160,6 @@ class SolvedScene:
             albedo=first.albedo,
             camera=first.camera,
             world_from_camera=first.world_from_camera,
-            lights=first.lights,
             gloss=None if self.gloss is None or weights is None else replace(self.gloss, weights=weights),
             view=first.name,
             further=further,
@@ -234,7 +203,6 @@ def save_fields(fields: SolvedScene, path: Path) -> None:
         "camera": asdict(fields.camera),
         "ground_height": fields.ground_height,
         "unit": fields.unit,
-        "light_trial": None if fields.light_trial is None else asdict(fields.light_trial),
         "doubts": fields.doubts,
         "interreflection": fields.interreflection,
         "light_share": fields.light_share,
@@ -255,7 +223,6 @@ class _Header(_ViewHeader, kw_only=True):
     spacing: Annotated[float, Meta(ge=1 / LARGEST_LENGTH, le=LARGEST_LENGTH)]
     ground_height: Length
     unit: Literal["mm", "scene"]
-    light_trial: Verdict | None = None
     doubts: tuple[Text, ...] = ()
     interreflection: Number = 0.0
     light_share: Number = 0.0
@@ -305,10 +272,8 @@ def _checked(tensors: Mapping[str, Tensor], rest: _Header) -> SolvedScene:
         first.world_from_camera,
         rest.ground_height,
         rest.unit,
-        first.lights,
         gloss,
         tensors["evidence"].float() if "evidence" in tensors else None,
-        rest.light_trial,
         rest.doubts,
         rest.interreflection,
         rest.view,
@@ -326,7 +291,7 @@ def _checked_view(
         ValueError, CalibrationError: as of `_checked`.
     """
     camera = rest.camera
-    albedo_name, pose_name, lights_name, weights_name = (f"{name}_{number}" if number else name for name in OF_A_VIEW)
+    albedo_name, pose_name, weights_name, _ = (f"{name}_{number}" if number else name for name in OF_A_VIEW)
     if albedo_name not in tensors or pose_name not in tensors:
         raise ValueError(f"the tensors {albedo_name!r} and {pose_name!r} were needed")
     albedo = tensors[albedo_name]
@@ -334,7 +299,6 @@ def _checked_view(
         pixels = f"{albedo.shape[1]} x {albedo.shape[0]} pixels of albedo"
         raise ValueError(f"{pixels} were found, {camera.width} x {camera.height} as of the camera were needed")
     refuse_outside(tensors, 0.0, BRIGHTEST, albedo_name, weights_name)
-    refuse_outside(tensors, -LARGEST_LENGTH, LARGEST_LENGTH, lights_name)
     pose, moved = _pose(tensors, pose_name), f"{MOTION}_{number}"
     motion = _pose(tensors, moved) if moved in tensors else None
     reach = MOST_BOXES * grid.spacing * max(grid.values.shape)
@@ -343,13 +307,10 @@ def _checked_view(
         raise ValueError(f"the camera is farther than {MOST_BOXES:g} times the grid's size from it")
     if not pose.translation[2] > ground:
         raise ValueError(f"the ground is at {ground:g}, a camera above the ground was needed")
-    lights = tensors.get(lights_name)
-    if lights is not None and not 0 < len(lights) <= MOST_LIGHTS:
-        raise ValueError(f"{len(lights)} lights were found, at most {MOST_LIGHTS} were needed")
     weights = tensors[weights_name].float() if weights_name in tensors else None
     if weights is not None and tuple(weights.shape[:2]) != (camera.height, camera.width):
         raise ValueError(f"weights of lobes of shape {tuple(weights.shape)} were found, of each pixel needed")
-    return FurtherView(rest.name, albedo.float(), camera, pose, lights, weights, motion)
+    return FurtherView(rest.name, albedo.float(), camera, pose, weights, motion)
 
 
 def _pose(tensors: Mapping[str, Tensor], name: str) -> Pose:

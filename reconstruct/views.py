@@ -29,11 +29,6 @@ def each(given: Thing | tuple[Thing, ...]) -> tuple[Thing, ...]:
     return given if isinstance(given, tuple) else (given,)
 
 
-def by_scene(scenes: Scenes, values: np.ndarray) -> list[np.ndarray]:
-    """Split values, one for each photo of all scenes, into those of each scene."""
-    return np.split(values, np.cumsum([len(scene.lights) for scene in scenes])[:-1])
-
-
 def first_photos(scenes: Scenes) -> list[int]:
     """Return the number of each scene's first photo."""
     return np.cumsum([0, *(len(scene.lights) for scene in scenes[:-1])]).tolist()

@@ -42,7 +42,7 @@ class CalibrateResearch:
     """For scenes with known lights: which transforms_SPLIT.json to read."""
     light_error: float = 0.0
     """How far the lights may be off, as a share of their distance (0.03: 3 %), where that is more than the calibration
-    says; uncertain lights are refined together with the surface. 0: known lights stay where they are."""
+    says. Of known lights, one more must then agree before matter is carved away; the result's sigma grows."""
     ground: str = "auto"
     """Where the ground is: auto (as the board or the scene's files say), a height (world z), or unknown: then the scale
     of the result is an assumption, and the report says so."""

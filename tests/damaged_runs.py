@@ -28,7 +28,7 @@ from calibration.side_view import SideView
 from reconstruct.appearance.brdf import LOBES, Gloss
 from reconstruct.detail.file import DETAIL, Detail, save_details
 from reconstruct.detail.surface import Window
-from reconstruct.fields import FurtherView, SolvedScene, Verdict, load_fields, save_fields
+from reconstruct.fields import FurtherView, SolvedScene, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
 from reconstruct.solve.checkpoint import write_checkpoint
 from viewer.stage.page import write_stage
@@ -47,12 +47,11 @@ SPARSE = 8 << 30  # bytes that a file says it has
 
 def make(folder: Path, has_stage: bool = True) -> Path:
     """A finished run with every file that one may hold."""
-    n_lights = 6
-    truth = fake_run.make_truth(64, n_lights)
+    truth = fake_run.make_truth(64, 6)
     run = folder / "heap"
     fake_run.start_run(run, truth)
     fake_run.finish_run(run, truth)
-    fields = _all_known(fake_run.fields_of(truth), n_lights)
+    fields = _all_known(fake_run.fields_of(truth))
     save_fields(fields, run / "fields.safetensors")
     save_mesh(extract_mesh(fields), run / "mesh.ply", run / "mesh.glb", "mm")
     (run / "hull.ply").write_bytes((run / "preview.ply").read_bytes())
@@ -67,10 +66,6 @@ def make(folder: Path, has_stage: bool = True) -> Path:
     state = json.dumps({"iteration": 0, "spacing": fields.grid.spacing})
     tensors = {"start": fields.grid.values.contiguous(), "origin": fields.grid.origin}
     write_checkpoint(tensors, {"format": "6", "fingerprint": "x", "state": state}, run / "checkpoint.safetensors")
-    report = json.loads((run / "report.json").read_text())
-    rows = [{"photo": "p.jpg", "position": [1.0, 2, 300], "moved": 1.0, "sigma": [1.0, 1, 1], "sigmas": 1.0}]
-    trial = {"accepted": True, "sentence": "refined lights accepted", "calibrated": 0.1, "refined": 0.05, "noise": 0.01}
-    _write(run / "report.json", report | {"refined_lights": rows, "light_trial": trial})
     calibration = fake_run.calibration_of(truth)
     told = {"notes": ["a note"], "shading_rms_by_photo": {light.photo: 0.01 for light in calibration.lights}}
     save_calibration(replace(calibration, residuals=calibration.residuals | told), run / "calibration.json")
@@ -95,7 +90,7 @@ def make_several(folder: Path) -> Path:
     fields = load_fields(run / "fields.safetensors")
     poses = {"view_2": (own.world_from_camera, None), "turned_1": (object_pose.first.world_from_camera, motion)}
     further = tuple(
-        FurtherView(name, fields.albedo, fields.camera, pose, torch.ones(5, 4), object_from_world=moved)
+        FurtherView(name, fields.albedo, fields.camera, pose, object_from_world=moved)
         for name, (pose, moved) in poses.items()
     )
     fields = replace(fields, view="view_1", further=further, gloss=None, light_share=0.01)
@@ -117,15 +112,13 @@ def _side_view(own: Calibration) -> SideView:
     return SideView("side.jpg", own.posed_camera, (4, 4, 32, 24), mask, np.ones_like(mask), 1.0)
 
 
-def _all_known(fields: SolvedScene, n_lights: int) -> SolvedScene:
+def _all_known(fields: SolvedScene) -> SolvedScene:
     height, width = fields.albedo.shape[:2]
     weights = torch.full((height, width, 1), 0.1)
     return replace(
         fields,
-        lights=torch.ones(n_lights - 1, 4),
         gloss=Gloss(torch.full((1, LOBES, 3), 0.01), weights),
         evidence=torch.full(fields.grid.values.shape, 3.0),
-        light_trial=Verdict(0.1, 0.05, 0.01),
     )
 
 

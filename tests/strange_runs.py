@@ -63,7 +63,7 @@ def by_names(draw: random.Random, run: Path) -> str:
     name = draw.choice(NAMES)
     if path.name == "calibration.json" and draw.random() < 0.5:
         document |= {"view": name, "further_views": [dict(document) | {"view": draw.choice(NAMES)}]}
-    for rows in ("lights", "photos", "refined_lights", "notes", "views"):
+    for rows in ("lights", "photos", "notes", "views"):
         for row in document.get(rows, []):
             if draw.random() < 0.5 and isinstance(row, dict):
                 row["photo" if "photo" in row else "name"] = name

@@ -190,8 +190,8 @@ def test_pieces_in_the_air_are_warned_of_and_objects_on_the_ground_are_not():
     fields = SolvedScene(grid, torch.zeros(12, 16, 3), camera, pose, 0.0, "mm")
     box = trimesh.creation.box(bounds=[[0, 0, 0], [10, 10, 10]])
     beside, above = box.copy().apply_translation([20, 0, 0]), box.copy().apply_translation([0, 0, 30])
-    assert pieces(box, fields) == []
-    assert pieces(trimesh.util.concatenate([box, beside]), fields) == []
+    assert pieces(box, fields, 20) == []
+    assert pieces(trimesh.util.concatenate([box, beside]), fields, 20) == []
     apart = trimesh.util.concatenate([box, above])
-    assert "2 pieces, 1 of them in the air: shadows that contradict" in pieces(apart, fields)[0]
-    assert "in the air: 5 photos leave open" in pieces(apart, replace(fields, lights=torch.ones(5, 4)))[0]
+    assert "2 pieces, 1 of them in the air: shadows that contradict" in pieces(apart, fields, 20)[0]
+    assert "in the air: 5 photos leave open" in pieces(apart, fields, 5)[0]

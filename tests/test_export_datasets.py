@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from fake_run import fields_of, make_truth, mesh_of
 from laid_anew import laid_anew
 
@@ -15,11 +14,10 @@ from calibration.lights.files import read_lights
 from calibration.scenes.importers import find_importer
 from capture.errors import ReconstructionError
 from capture.photos.photo import read_alpha, read_photo, write_picture
-from reconstruct.export.dataset import centred, open_dataset
+from reconstruct.export.dataset import centred
 from reconstruct.export.datasets import colmap_camera
 from reconstruct.export.export import ExportOptions, export
 from reconstruct.fields import save_fields
-from reconstruct.stored_run.stored_run import StoredRun
 
 LENS = (-0.12, 0.05, 0.001, -0.002, 0.01)
 
@@ -180,16 +178,6 @@ def test_a_missing_photo_is_named_nothing_is_left_and_a_folder_that_holds_someth
     with pytest.raises(ReconstructionError, match="exists and is not empty"):
         exported(finished, "rti", tmp_path)
     assert [path.name for path in (tmp_path / "rti").iterdir()] == ["note.txt"]
-
-
-def test_lights_that_the_solve_moved_are_exported_where_they_are_now(finished):
-    run = StoredRun(finished[0])
-    moved = torch.tensor([[*np.array(light.position) + 5, 1.0] for light in run.calibration.lights])
-    run.fields = replace(run.fields, lights=moved)
-    unsure = tuple(replace(light, sigma=np.ones(3)) for light in run.calibration.lights)
-    run.calibration = replace(run.calibration, lights=unsure)
-    data = open_dataset(run)
-    np.testing.assert_allclose(np.array([x.position for x in data.lights], float), moved[:, :3], atol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["shadowneus", "rti", "colmap", "nerf"])

@@ -107,8 +107,6 @@ def test_where_both_ways_explain_the_table_the_powers_decide():
     for found in (by_model, by_field):
         assert truth.overlap(found.mask) > 0.9
         assert truth.wrong(found) < 0.02
-    again = label_ground(unknown, by_field)
-    assert torch.equal(again.mask, by_field.mask) and torch.equal(again.visibility, by_field.visibility)
 
 
 @pytest.mark.parametrize("off", [0, 0.12])
@@ -121,8 +119,6 @@ def test_an_object_nearly_black_is_no_ground_in_shadow(off):
     found = label_ground(scene)
     assert truth.overlap(found.mask) > 0.95
     assert (found.confidence.numpy() * truth.mask)[:, found.mask.numpy() > 0.5].max() < 0.05  # no shadows on it
-    moved = label_ground(replace(scene, lights=scene.lights * torch.tensor([1.02, 1.02, 1.02, 1.0])), found)
-    assert torch.equal(moved.mask, found.mask)
 
 
 # --- level tops ------------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from dataset_folders import write_shadowneus
+from dataset_folders import calibrated, write_shadowneus
 from synthetic import BALL, Look, render
 
 from calibration.scenes.shadowneus import IMPORTER, load_known_scene
@@ -93,3 +93,13 @@ def test_a_split_that_is_not_there_names_those_that_are(tmp_path):
     write_scene(tmp_path)
     with pytest.raises(CalibrationError, match=r"transforms_test.json does not exist.*transforms_train.json"):
         load_known_scene(tmp_path, "test")
+
+
+def test_a_stated_light_error_makes_known_lights_uncertain(tmp_path):
+    write_scene(tmp_path / "scene", light_type="point")
+    for light in calibrated(tmp_path / "scene", light_error=0.03)[2].lights:
+        assert light.position is not None
+        distance = np.linalg.norm(light.position)  # the camera looks at the ground 15 mm beside the origin
+        assert np.linalg.norm(light.sigma) == pytest.approx(0.03 * distance, rel=0.05)
+    with pytest.raises(CaptureError, match="--light-error 3"):
+        open_source(tmp_path / "scene", RunOptions(light_error=3.0))

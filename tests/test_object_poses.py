@@ -12,17 +12,18 @@ from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from reconstruct.appearance.brdf import LOBES, Gloss
 from reconstruct.fields import FurtherView, SolvedScene, load_fields, save_fields
+from reconstruct.labels.held_out import hold_out
 from reconstruct.labels.observer import Observer
-from reconstruct.labels.supervision import supervise
+from reconstruct.labels.supervision import placed_rays, supervise
 from reconstruct.object_poses import alignment
 from reconstruct.object_poses import confirmed as confirmation
 from reconstruct.object_poses.alignment import Alignment, SeenSurface, align, angle_between, mean_difference, stepped
 from reconstruct.object_poses.confirmed import Met, confirmed, how_met, withheld
+from reconstruct.object_poses.light_motions import MODES, LightMotions, unseen_motion
 from reconstruct.object_poses.motion_refine import MotionTrial, ObjectPoseRays, compare, refined_motion
 from reconstruct.object_poses.together import PlacedObjectPose, SolvedObjectPose, Together, lay_together, merged_surface
 from reconstruct.render.g_buffer import seen_material
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.solve.light_refine import MovingLights, no_shift
 from reconstruct.views import placed
 
 COLOUR = (0.7, 0.5, 0.3)
@@ -135,16 +136,37 @@ def test_object_poses_of_an_object_of_a_few_voxels_are_named_and_the_first_is_ke
     assert not found.placed and "voxels of the object are seen" in dict(found.refused)["turned_1"]
 
 
-def test_lights_of_another_object_pose_move_in_its_own_world(laid):
+def test_a_placed_scene_meets_the_surface_as_the_scene_does_in_its_own_world(laid, own_rays):
     scene, motion = laid
     there = replace(scene, object_from_world=motion)
-    own, moved = (MovingLights((one,), no_shift((one,))) for one in (scene, there))
-    np.testing.assert_allclose(moved.in_grid(np.zeros(3), 1.0)[:, :3], placed(there).lights[:, :3].numpy(), atol=1e-3)
-    gradient = np.random.default_rng(0).standard_normal((len(scene.lights), 4)) ** 2
-    turned = np.concatenate([motion.rotate(gradient[:, :3]), gradient[:, 3:]], 1)
-    own.follow(gradient, 0.5, 20)
-    moved.follow(turned, 0.5, 20)
-    np.testing.assert_allclose(moved.shift.shift, own.shift.shift, atol=1e-9)
+    every = np.ones(own_rays.confidence.shape, bool)
+    errors = []
+    for one, surface in ((scene, grid_of(lying()[0], 2.5)), (there, grid_of(SHAPES, 2.5))):
+        errors.append(hold_out(placed_rays(own_rays, one), every)[1].errors(surface, placed(one)))
+    assert errors[0].mean() < 0.1 and np.abs(errors[0] - errors[1]).mean() < 0.02
+
+
+def test_a_homology_about_the_eye_keeps_what_is_in_line():
+    scene, _ = render((SHAPES[0],), Look(n_lights=6))
+    scene = replace(scene, light_sigma=torch.ones(6, 3))
+    eye, lights = scene.eye.double().numpy(), scene.lights.double().numpy()[:, :3]
+    small = 1e-9  # moves the lights by some 1e-4 mm
+    moved = lights + small * unseen_motion(scene)
+    for light, light_moved in zip(lights, moved, strict=True):
+        foot = np.array([30.0, -20.0, 0.0])
+        blocker = foot + 0.2 * (light - foot)
+        blocker_moved = blocker + small * blocker[2] * (eye - blocker)
+        away = np.cross(blocker_moved - foot, light_moved - foot)
+        alone = np.cross(blocker - foot, light_moved - foot)
+        assert np.linalg.norm(away) < 1e-3 * np.linalg.norm(alone)  # of second order
+
+
+def test_a_direction_that_is_moved_stays_a_unit_vector():
+    scene, _ = render(SHAPES, Look(n_lights=4, kind="directional"))
+    scene = replace(scene, light_sigma=torch.full((4, 3), 0.02))
+    turned = LightMotions(scene, np.zeros(3), np.ones(MODES)).scene()
+    torch.testing.assert_close(turned.lights.norm(dim=1), torch.ones(4))
+    assert (turned.lights != scene.lights).any(1).all()
 
 
 def test_a_motion_a_little_off_is_refined_on_rays_and_held_out_rays_agree(laid, own_rays):
@@ -202,7 +224,7 @@ def test_a_solved_scene_of_two_object_poses_equals_its_file_and_knows_both_world
     albedo = torch.full((48, 64, 3), 0.5)
     place = (first.camera, first.world_from_camera, 0.0, "mm")
     grid, gloss = grid_of(SHAPES, 2.5), Gloss(torch.full((1, LOBES, 3), 0.25), torch.ones(48, 64, 1))
-    other = (scene.camera, scene.world_from_camera, scene.lights, torch.ones(48, 64, 1), motion)
+    other = (scene.camera, scene.world_from_camera, torch.ones(48, 64, 1), motion)
     there = FurtherView("turned_1", albedo, *other)
     more = {"gloss": gloss, "evidence": torch.full_like(grid.values, 3.0), "light_share": 0.03}
     fields = SolvedScene(grid, albedo, *place, further=(there,), **more)

@@ -52,16 +52,6 @@ def test_the_albedo_of_the_ground_is_found_under_ambient_light():
     assert on[~truth.mask].mean() > 0.97 and np.median(error) < 0.01
 
 
-def test_the_ground_is_tested_again_only_when_lights_moved_by_more_than_its_gains_take_up():
-    scene, _ = render((BALL,), PLAIN)
-    first = ground_module.test_ground(scene)
-    near, far = (replace(scene, lights=scene.lights * torch.tensor([1.0, 1.0, up, 1.0])) for up in (1.01, 1.3))
-    assert ground_module.tests_alike(scene, near) and not ground_module.tests_alike(scene, far)
-    again = ground_module.test_ground(near)
-    assert float(((again.visibility - first.visibility).abs() > 0.1).float().mean()) < 1e-3
-    assert float(((again.mask - first.mask).abs() > 0.1).float().mean()) < 1e-3
-
-
 def test_of_two_levels_that_as_many_photos_show_the_brighter_is_lit_ground():
     shown = torch.tensor([[0.5, 0.3, 0.5, 0.3, 0.5, 0.3], [0.3, 0.3, 0.3, 0.3, 0.5, 0.5]])
     assert ground_module._densest(shown).tolist() == pytest.approx([0.5, 0.3])

@@ -76,7 +76,7 @@ def test_the_true_surface_is_left_alone_by_its_own_shadows():
     shoot = RayPasses(surface, scene, rays, FitConfig(rays=20_000))
     for i in range(40):
         if i % 5 == 0:
-            shoot.look(surface.grid(), scene, i, 8.0, 0.5)
+            shoot.look(surface.grid(), i, 8.0, 0.5)
         shoot(i, 8.0)
         surface.step(2, 0.3, 0.0, 0.0, 4, 0.1)
         if solver.is_rest(i, SMALL.levels[0]):

@@ -42,7 +42,7 @@ OnProgress = Callable[[int, int, str], None]  # done, total, what is being done
 class Illumination:
     """The light at the surface of a solved scene, without shadows. World frame."""
 
-    scene: Scene  # small, with the lights refined by the solve
+    scene: Scene  # small
     indirect: Indirect
     noise: Noise
 
@@ -53,8 +53,6 @@ def estimate_illumination(scene: Scene, fields: SolvedScene) -> Illumination:
     Args:
         scene: photos that the surface was solved from, in their order.
     """
-    if fields.lights is not None and len(fields.lights) == len(scene.lights):
-        scene = replace(scene, lights=fields.lights)
     ground = label_ground(scene) if scene.ground_known else None
     noise = DEFAULT_NOISE if ground is None else ground.noise
     maps = surface_maps(fields.grid, replace(scene.posed_camera, ground_height=fields.ground_height))

@@ -21,7 +21,7 @@ from capture.files.names import stored_file
 from capture.photos.photo import read_photo
 from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import look
-from reconstruct.render.relight import relight, with_refined_lights
+from reconstruct.render.relight import relight
 from reconstruct.stored_run.stored_run import StoredRun
 
 UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")  # in file names of lists that are split at spaces, or on other systems
@@ -33,7 +33,7 @@ class Dataset:
     """One picture per light, in order. World frame and unit of the run."""
 
     run: StoredRun
-    lights: tuple[Light, ...]  # those that were used, where the solve left them; `photo` is the capture's file name
+    lights: tuple[Light, ...]  # those that were used; `photo` is the capture's file name
     camera: Camera  # of the pictures
     photos: tuple[Path, ...] | None  # the capture's; None: the surface is relit
     calibration: Calibration  # of the view
@@ -89,7 +89,7 @@ def open_dataset(run: StoredRun, photos: Path | None = None) -> Dataset:
 
 
 def _of_view(run: StoredRun, photos: Path | None, view: str, calibration: Calibration, fields: SolvedScene) -> Dataset:
-    used = [light for light in with_refined_lights(calibration, fields).lights if light.used]
+    used = [light for light in calibration.lights if light.used]
     if not used:
         raise ReconstructionError(
             f"{run.run_dir} has no light that was used; at least one was needed. Calibrate again."

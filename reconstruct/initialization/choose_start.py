@@ -76,8 +76,8 @@ class Start(Protocol):
         """Return the better of two surfaces."""
         ...
 
-    def doubts(self, scenes: Scenes) -> tuple[str, ...]:
-        """Return warnings about lights that contradict each other, under the final ones."""
+    def doubts(self) -> tuple[str, ...]:
+        """Return warnings about lights that contradict each other."""
         ...
 
 
@@ -144,7 +144,7 @@ class HullStart:
 
     def __init__(self, scenes: Scenes, observers: tuple[Observer, ...], config: FitConfig, say: Say, name: str = HULL):
         self._scenes, self._observers, self.config, self._say = scenes, observers, config, say
-        self._doubts: tuple[str, ...] | None = None  # of lights that cannot move
+        self._doubts: tuple[str, ...] | None = None  # where no better surface changes the ground's labels
         self.name = name  # LIT_HULL if the normals of shadow pictures made it better: surface() decides
 
     def surface(self, show: Show = lambda _: None) -> SdfGrid:
@@ -159,7 +159,7 @@ class HullStart:
         if len(views) > 1:
             return hull
         scene, observer = views[0]
-        if scene.ground_depth is None and not (bool(scene.light_sigma.any()) or is_shared(scene)):
+        if scene.ground_depth is None and not is_shared(scene):
             self._doubts = _doubts(scene, ground_labels[0], found.maps)  # these maps are made once
         bent = BentHull(scene, observer, self.config, self._say).found(hull, resampled(found.space, nodes).grid())
         if scene.rgb is None and bent is not hull:
@@ -179,13 +179,13 @@ class HullStart:
         """Return the found surface: the hull is never better."""
         return found
 
-    def doubts(self, scenes: Scenes) -> tuple[str, ...]:
+    def doubts(self) -> tuple[str, ...]:
         """Return the contradictions between the shadows on the ground in a view; uneven ground is not judged."""
-        if scenes[0].ground_depth is not None:
+        if self._scenes[0].ground_depth is not None:
             return ()
         if self._doubts is not None:
             return self._doubts
-        views = zip(scenes, self._observers, strict=True)
+        views = zip(self._scenes, self._observers, strict=True)
         return tuple(said for scene, observer in views for said in _doubts(scene, observer.ground_labels()))
 
 
@@ -221,7 +221,7 @@ class HeightStart:
 
     def __init__(self, scene: Scene, observer: Observer, config: FitConfig, say: Say):
         self._scene, self._observer, self._say = scene, observer, say
-        self._judge: tuple[SdfGrid, Scene, HeldOut] | None = None  # see labels
+        self._judge: tuple[SdfGrid, float, HeldOut] | None = None  # a surface, the ground's height, and its rays
         self._nodes = min(MOST_NODES, round(NODES_PER_PIXEL * max(scene.camera.width, scene.camera.height)))
         level = Level(self._nodes, ITERATIONS, RATE, config.levels[-1].blur)
         self.config = replace(config, levels=(level,), sharpness=SHARPNESS, curvature=CURVATURE)
@@ -244,7 +244,7 @@ class HeightStart:
         (scene,) = scenes
         labels = self._with_isolated_pixels(self._observer.labels(surface, scene))
         if self._judge is None:
-            self._judge = (surface, scene, self._held_out(scene, labels))
+            self._judge = (surface, scene.ground_height, self._held_out(scene, labels))
         return (without(labels, self._drawn()),)
 
     def better(self, start: SdfGrid, found: SdfGrid, scenes: Scenes) -> SdfGrid:
@@ -256,8 +256,8 @@ class HeightStart:
     def _judge_of(self, start: SdfGrid, scene: Scene) -> HeldOut:
         """Return the rays held out, by the labels of a surface: those read last time are not read again."""
         if self._judge is not None:
-            read, under, held_out = self._judge
-            if read is start and torch.equal(under.lights, scene.lights) and under.ground_height == scene.ground_height:
+            read, height, held_out = self._judge
+            if read is start and height == scene.ground_height:
                 return held_out
         return self._held_out(scene, self._with_isolated_pixels(self._observer.labels(start, scene)))
 
@@ -265,7 +265,7 @@ class HeightStart:
         rays = supervise(scene, labels)
         return hold_out(rays, self._drawn()[:, rays.pixels], with_outline=True)[1]
 
-    def doubts(self, scenes: Scenes) -> tuple[str, ...]:
+    def doubts(self) -> tuple[str, ...]:
         """Return nothing: without bare ground no light's shadow can be judged by itself."""
         return ()
 

@@ -54,7 +54,7 @@ TOO_BRIGHT, MANY = 0.5, 3  # log units: a highlight; in so many photos, ground w
 AMBIENT_SHARE = 0.7  # of the light in shadows on the ground: the rest comes from the lit ground and the object
 
 
-def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
+def label_ground(scene: Scene) -> GroundTest:
     """Classify pixels as object or ground, and label the shadows on it: by the lights' model, or by a field of light.
 
     The outline is the field's, to which the model is one more witness, see _witness; it is the model's where the field
@@ -62,19 +62,11 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     photos' powers contradict it, see _powers_off. How quiet the fits are is no evidence: the field bends to what it is
     fitted to, and so do the model's gains.
 
-    Args:
-        before: of the same photos under other lights; what does not depend on them is taken from it.
-
     Raises:
         ValueError: the scene has no photos (scene.rgb is None).
     """
-    outline = None if before is None else Outline(before.mask, before.mask_confidence)
-    if before is not None and before.bare is not None:
-        return _by_field(scene, before.bare, outline)
     if is_shared(scene):
         return test_ground(split_on_ground(scene))
-    if before is not None:
-        return test_ground(scene, before.background, outline if before.keeps_outline else None)
     tested = test_ground(scene)
     if scene.ground_depth is not None:
         return tested
@@ -137,14 +129,13 @@ def _witness(by_model: GroundTest) -> Int8[np.ndarray, "height width"]:
     return (said * (by_model.mask_confidence.numpy() > 0)).astype(np.int8)
 
 
-def _by_field(scene: Scene, bare: BareGround, outline: Outline | None = None) -> GroundTest:
+def _by_field(scene: Scene, bare: BareGround) -> GroundTest:
     """Return what the field of light says of the photos.
 
     Args:
         bare: what of the picture is ground in this field.
-        outline: the object's, where it is known already.
     """
-    outline = _mask(scene, bare) if outline is None else outline
+    outline = _mask(scene, bare)
     field, mask = bare.field, outline.mask
     region = mask.numpy() > 0.5
     points = ground_points(scene).double().numpy()

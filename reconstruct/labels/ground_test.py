@@ -37,7 +37,6 @@ FEWEST_AGREEING = 4  # lit samples that agree on the pixel's ground albedo; fewe
 PENUMBRA = 3  # px: such parts are wider
 FEWEST_SAMPLES = 3  # seen samples that a pixel needs to be classified
 RIM, RIM_SHARE = 2, 0.4  # px around a found mask, and the share of their confidence that ground labels keep there
-FAINTEST = 1e-4  # of the strongest light: fainter light is taken as this strong
 PIXELS_AT_ONCE = 32768  # of the irradiance, which needs six numbers per pixel and photo
 GAIN_FIT_PIXELS = 4000  # ground pixels that a photo's six gain coefficients are fitted to
 
@@ -57,7 +56,6 @@ class GroundTest:
     explained: float = 1.0  # share of the pixels with light and ground to compare with that behave as ground
     bare: BareGround | None = None  # what a field of light says, where it made the labels and not the lights' model
     ambient: float = 0.0  # irradiance of everything but the light, as that field's shadows show it
-    keeps_outline: bool = False  # the outline was told to it, and stays as it is when the lights move
 
 
 @dataclass(frozen=True)
@@ -114,8 +112,7 @@ def test_ground(
     if scene.mask is None:  # missed parts of the object lie beside the mask; a false lit pixel there would carve them
         confidence *= torch.where(dilated(mask > 0.5, 2 * RIM + 1), RIM_SHARE, 1.0)
     strange = float(((behaves.between >= NOT_GROUND) & behaves.known).sum() / behaves.known.sum().clamp(min=1))
-    labels = visibility, confidence, albedo, gain, noise, background, 1 - strange
-    return GroundTest(mask, mask_confidence, *labels, keeps_outline=outline is not None)
+    return GroundTest(mask, mask_confidence, visibility, confidence, albedo, gain, noise, background, 1 - strange)
 
 
 def _behaviour(scene: Scene) -> tuple[_Behaviour, Float[Tensor, "photos height width"], Noise]:
@@ -181,7 +178,11 @@ def _densest(ratio: Float[Tensor, "n photos"]) -> Float[Tensor, " n"]:
 
 def _smooth_gain(scene: Scene, samples: _Samples) -> Float[Tensor, "photos n"]:
     """Fit one gain per photo to its lit ground samples: exp of a quadratic in the pixel's position; fitted twice."""
-    basis, picked = _gain_basis(scene)
+    height, width = scene.directions.shape[:2]
+    v, u = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
+    u, v = u.reshape(-1), v.reshape(-1)
+    basis, step = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v], -1), max(1, len(u) // GAIN_FIT_PIXELS)
+    picked = slice(step // 2, None, step)
     some = _Samples(samples.value[:, picked], samples.expected[:, picked], samples.usable[:, picked])
     rows, gain = basis[picked], torch.ones_like(some.value)
     solved = torch.zeros(len(gain), basis.shape[1])
@@ -197,39 +198,6 @@ def _smooth_gain(scene: Scene, samples: _Samples) -> Float[Tensor, "photos n"]:
         solved = torch.linalg.solve(normal, torch.einsum("kn,na->ka", weight * logs, rows)) * enough[:, None]
         gain = (solved @ rows.T).clamp(-LIT_BAND, LIT_BAND).exp()
     return (solved @ basis.T).clamp(-LIT_BAND, LIT_BAND).exp()
-
-
-def _gain_basis(scene: Scene) -> tuple[Float[Tensor, "n 6"], slice]:
-    """Return what a photo's log gain is a combination of, for every pixel, and the pixels that it is fitted to."""
-    height, width = scene.directions.shape[:2]
-    v, u = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
-    u, v = u.reshape(-1), v.reshape(-1)
-    step = max(1, len(u) // GAIN_FIT_PIXELS)
-    return torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v], -1), slice(step // 2, None, step)
-
-
-def tests_alike(before: Scene, after: Scene) -> bool:
-    """Return whether the ground test says the same under moved lights, because its gains take up what changes.
-
-    The change of the log irradiance of level ground, less its quadratic in the pixel's position, must stay below
-    ALIKE (root mean square) in every photo: below the least error that the test grants a lit sample.
-
-    Args:
-        before, after: the same photos under other lights.
-    """
-    if before.ground_depth is not None:  # its own shadows move with the lights
-        return False
-    basis, picked = _gain_basis(before)
-    basis, points = basis[picked], ground_points(before).reshape(-1, 3)[picked]
-    basis, points = basis[points.isfinite().all(-1)], points[points.isfinite().all(-1)]
-    logs = []
-    for scene in (before, after):
-        towards, strength = grey_irradiance(scene, points)
-        logs.append((strength * towards[..., 2]).clamp(min=FAINTEST * float(strength.max())).log())
-    change = (logs[1] - logs[0]).T
-    smooth = basis @ torch.linalg.lstsq(basis, change).solution
-    rest = (change - smooth).square().mean(0).sqrt()
-    return bool((rest < ALIKE).all() and (smooth.abs() < 0.5 * LIT_BAND).all())
 
 
 def _noise(samples: _Samples, relative: Float[Tensor, "photos n"], shape: torch.Size) -> Noise:

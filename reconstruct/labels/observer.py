@@ -13,7 +13,7 @@ from reconstruct.appearance.brdf import Gloss
 from reconstruct.appearance.lobe_fit import Indirect, from_endless_ground
 from reconstruct.fields import SolvedScene
 from reconstruct.labels.field_ground_test import label_ground
-from reconstruct.labels.ground_test import GroundTest, empty_ground_test, test_ground, tests_alike
+from reconstruct.labels.ground_test import empty_ground_test, test_ground
 from reconstruct.labels.highlights import (
     lit_pixels,
     material_without_ground,
@@ -36,10 +36,6 @@ from reconstruct.sdf.level_set import carried
 from reconstruct.sdf.rays import first_hits
 
 
-def _tested(scene: Scene, before: GroundTest | None = None) -> GroundTest:
-    return label_ground(scene, before) if scene.ground_known else empty_ground_test(scene)
-
-
 def _with_outline(labels: Labels, outline: Outline) -> Labels:
     return replace(labels, mask=outline.mask, mask_confidence=outline.confidence)
 
@@ -48,12 +44,11 @@ class Observer:
     """Compute the labels of one scene's pictures, given an estimate of the surface."""
 
     def __init__(self, scene: Scene):
-        self._scene = self._calibrated = scene  # with its current lights, and with its first ones
+        self._scene = scene
         self._ground = None
         if scene.rgb is not None:
             check_lights(scene)
-            self._ground = _tested(scene)
-        self._first = self._ground
+            self._ground = label_ground(scene) if scene.ground_known else empty_ground_test(scene)
         self._relief = ground_relief(scene)
         self._carried: tuple[SdfGrid, SdfGrid] | None = None  # a surface, and the same in the scene's world
 
@@ -68,7 +63,7 @@ class Observer:
         """Return the labels of ground and object; the object's are computed where pixel rays meet the surface.
 
         Args:
-            scene: the observer's scene with its current lights; if they moved much, the ground is tested again.
+            scene: the observer's, with the ground that the surface stands on.
         """
         surface = self.in_world(surface)
         if self._ground is None:
@@ -76,7 +71,6 @@ class Observer:
             if not scene.mask_known:
                 labels = _with_outline(labels, outline_of(scene, surface, labels.confidence))
             return self._beside_relief(labels, surface)
-        self._follow(scene)
         points, normals = self.seen(surface)
         if is_shared(scene):
             scene = split_on_surface(scene, surface, points, normals, self._ground)
@@ -140,14 +134,13 @@ class Observer:
         return scene if material is None else with_powers(scene, material)
 
     def fields(self, surface: SdfGrid, scene: Scene) -> SolvedScene:
-        """Return the solved scene: the surface, the material estimated on it, and the current lights.
+        """Return the solved scene: the surface, and the material estimated on it.
 
         All in the scene's world, and so is the surface of another object pose.
         """
         surface = self.in_world(surface)
         if self._ground is None:
             return self._solved(surface, scene, self.labels(surface, scene).albedo, None)
-        self._follow(scene)
         points, normals = self.seen(surface)
         if is_shared(scene):
             scene = split_on_surface(scene, surface, points, normals, self._ground)
@@ -173,7 +166,7 @@ class Observer:
     ) -> SolvedScene:
         surface = surface if self._relief is None else cut_at_relief(surface, self._relief)
         camera = (scene.camera, scene.world_from_camera)
-        rest = (scene.ground_height, scene.unit, scene.lights, gloss)
+        rest = (scene.ground_height, scene.unit, gloss)
         middle = surface.origin.double().numpy() + 0.5 * surface.spacing * (np.array(surface.values.shape) - 1)
         return SolvedScene(
             surface,
@@ -220,19 +213,6 @@ class Observer:
         if self._carried is None or all(surface is not one for one in self._carried):
             self._carried = surface, carried(surface, motion.inverse())
         return self._carried[1]
-
-    def _follow(self, scene: Scene) -> None:
-        """Test the ground again if the lights moved by more than the gains of the first test take up.
-
-        Always compared with the first lights, so that a resumed solve finds the same.
-        """
-        if torch.equal(scene.lights, self._scene.lights):
-            return
-        self._scene = scene
-        if self._first is None or not scene.ground_known:
-            return
-        is_same = self._first.bare is None and not is_shared(scene) and tests_alike(self._calibrated, scene)
-        self._ground = self._first if is_same else _tested(scene, self._first)
 
     def _bounce(self, scene: Scene, points: Float[Tensor, "height width 3"]) -> Indirect:
         """Return the light that the lit ground reflects to the surface in each photo."""

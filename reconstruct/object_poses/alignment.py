@@ -341,7 +341,10 @@ def _ambiguous(pairs: _Pairs, a: Pose, b: Pose) -> str:
 
 
 def mean_difference(
-    a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], group: Int[np.ndarray, " n"]
+    a: Float[np.ndarray, " n"],
+    b: Float[np.ndarray, " n"],
+    group: Int[np.ndarray, " n"],
+    weight: Float[np.ndarray, " n"] | float = 1.0,
 ) -> tuple[float, float]:
     """Return the mean of a - b where both are known, and one sigma of it, from how it varies between groups.
 
@@ -349,17 +352,18 @@ def mean_difference(
     fewer than two groups.
 
     Args:
-        a, b: errors under two motions; nan where unknown.
+        a, b: errors of the same rays or points in two cases; nan where unknown.
         group: of each error, counted from 0.
     """
     known = np.isfinite(a) & np.isfinite(b)
-    change, own = (a - b)[known], group[known]
-    total, count = np.bincount(own, change), np.bincount(own)
+    counts = np.broadcast_to(weight, known.shape)[known]
+    change, own = counts * (a - b)[known], group[known]
+    total, count = np.bincount(own, change), np.bincount(own, counts)
     used = int((count > 0).sum())
     if used < 2:
         return 0.0, 0.0
-    mean = float(change.mean())
-    return mean, float(np.sqrt(used / (used - 1) * ((total - mean * count) ** 2).sum()) / known.sum())
+    mean = float(change.sum() / counts.sum())
+    return mean, float(np.sqrt(used / (used - 1) * ((total - mean * count) ** 2).sum()) / counts.sum())
 
 
 class _Field:

@@ -15,7 +15,7 @@ from jaxtyping import Bool
 from calibration.pose import Pose
 from reconstruct.labels.held_out import ValidationRays, draw_blocks, hold_out
 from reconstruct.labels.supervision import placed_rays
-from reconstruct.object_poses.alignment import SeenSurface, seen_surface
+from reconstruct.object_poses.alignment import SeenSurface, mean_difference, seen_surface
 from reconstruct.object_poses.motion_refine import ObjectPoseRays
 from reconstruct.object_poses.together import (
     STILL,
@@ -28,7 +28,6 @@ from reconstruct.object_poses.together import (
 )
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.solve.trials import judge
 from reconstruct.views import Scenes, first_photos, placed
 
 SEED = 3000  # of the rays that no solve uses, beside the seed
@@ -84,8 +83,9 @@ def how_met(object_pose: SolvedObjectPose, surface: SdfGrid, motion: Pose, seed:
     there = tuple(replace(scene, object_from_world=motion) for scene in object_pose.scenes)
     own, joint = (_held_out(object_pose.rays, scenes, seed) for scenes in (object_pose.scenes, there))
     errors = own.errors(object_pose.fields.grid, object_pose.scenes), joint.errors(surface, placed(there))
-    found = judge(own, *errors, sum(len(scene.lights) for scene in object_pose.scenes))
-    return Met(object_pose.name, found.calibrated, found.refined, found.noise)
+    difference, noise = mean_difference(errors[1], errors[0], own.photo, own.weight)
+    alone = float(own.weight @ errors[0] / max(own.weight.sum(), 1e-9))
+    return Met(object_pose.name, alone, alone + difference, noise)
 
 
 def confirmed(

@@ -11,7 +11,6 @@ towards the camera. They are unknowns of the refinement alone: the lights stay a
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -23,10 +22,10 @@ from capture.checks.robust import cauchy, geman_mcclure
 from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out
 from reconstruct.labels.supervision import SURE_ENOUGH, Supervision
 from reconstruct.object_poses.alignment import mean_difference, stepped
+from reconstruct.object_poses.light_motions import MODES, LightMotions
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import visibility
-from reconstruct.solve.light_refine import LightShift, common_motions, lit_from, unseen_motion
 from reconstruct.views import Scenes, placed
 
 SHARPNESS = (4.0, 8.0)  # NeuS s per voxel: the first sees an edge from a voxel away
@@ -36,7 +35,6 @@ WIDTH = 0.3  # difference from which a ray counts less
 SEED = 2000  # of the rays that judge, beside the seed
 JUDGING = 0.15  # of the blocks
 SIGMAS = 2.0  # of the noise: by more a refined motion is worse
-MODES = 6  # joint motions of a scene's lights
 CORRELATED = 100.0  # rays along a shadow's edge that count as one
 GROUPS = 10_000  # more than the photos of a scene
 NUDGE = 0.05  # voxels at the object's edge, over the sharpness of 8: of the finite differences
@@ -87,14 +85,14 @@ def refined_motion(
     """
     samples = _samples(object_pose, seed, is_judging=False)
     motion, middle = start, start.inverse().apply(about)
-    lights = [_JointMotions(scene, middle, np.zeros(MODES)) for scene in object_pose.scenes]
+    lights = [LightMotions(scene, middle, np.zeros(MODES)) for scene in object_pose.scenes]
     for sharpness in SHARPNESS:
         shift = NUDGE * SHARPNESS[-1] / sharpness * surface.spacing
         steps = shift * np.array([1 / radius] * 3 + [1.0] * 3)
         nudges = [own.nudges(shift / radius) for own in lights]
         sigma = np.concatenate([np.full(6, np.inf), *(1 / own for own in nudges)])
 
-        def residuals(pose: Pose, lit: list[_JointMotions], sharpness: float = sharpness) -> Float[np.ndarray, " n"]:
+        def residuals(pose: Pose, lit: list[LightMotions], sharpness: float = sharpness) -> Float[np.ndarray, " n"]:
             pairs = zip(samples, lit, strict=True)
             return np.concatenate([sample.residuals(surface, pose, sharpness, own.scene()) for sample, own in pairs])
 
@@ -151,37 +149,6 @@ def compare(
     return MotionTrial(float(errors[0].mean()), float(errors[1].mean()), noise)
 
 
-@dataclass(frozen=True)
-class _JointMotions:
-    """The lights of a scene, moved together by an amount of each of six motions: sigmas of the lights, mean square."""
-
-    calibrated: Scene
-    middle: Float[np.ndarray, "3"]  # of the object, in the scene's world
-    amounts: Float[np.ndarray, "6"]
-
-    @cached_property
-    def _modes(self) -> Float[np.ndarray, "6 photos 3"]:
-        """The motions, in sigmas of the lights per unit; 0 where all lights are known."""
-        modes = np.concatenate([unseen_motion(self.calibrated)[None], common_motions(self.calibrated)])
-        return modes / np.sqrt((modes**2).sum(2).mean(1)).clip(min=1e-12)[:, None, None]
-
-    def nudges(self, turn: float) -> Float[np.ndarray, "6"]:
-        """Return the amounts that displace the light that moves most by an angle as seen from the object, rad."""
-        lights, sigma = self.calibrated.lights.double().numpy(), self.calibrated.light_sigma.double().numpy()
-        distance = np.linalg.norm(lights[:, :3] - lights[:, 3:] * self.middle, axis=1)
-        angle = np.linalg.norm(self._modes * sigma, axis=2) / distance
-        return turn / angle.max(axis=1).clip(min=1e-12)
-
-    def changed(self, by: Float[np.ndarray, "6"]) -> "_JointMotions":
-        """Return the lights moved further."""
-        return replace(self, amounts=self.amounts + by)
-
-    def scene(self) -> Scene:
-        """Return the scene under these lights."""
-        shift = np.tensordot(self.amounts, self._modes, 1)
-        return lit_from(self.calibrated, LightShift(shift, np.zeros_like(shift)))
-
-
 def _samples(object_pose: ObjectPoseRays, seed: int, is_judging: bool) -> "list[_Sample]":
     """Draw the rays of each scene that refine, or the others that judge: whole blocks of pixels."""
     found = []
@@ -220,7 +187,7 @@ class _Sample:
         surface: SdfGrid,
         motion: Pose,
         sharpness: float,
-        lights: _JointMotions,
+        lights: LightMotions,
         nudges: Float[np.ndarray, "6"],
     ) -> Float[np.ndarray, "n 6"]:
         """Return the change of the residuals as each joint motion of the lights grows by its nudge."""

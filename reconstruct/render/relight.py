@@ -7,7 +7,6 @@ Predicted photos of a calibrated scene, for comparison with the real photos.
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,7 +17,6 @@ from torch.nn.functional import normalize
 from calibration.calibration import Calibration
 from calibration.light import Light, irradiance
 from reconstruct.appearance.brdf import reflectance, specular
-from reconstruct.fields import SolvedScene
 from reconstruct.render.environment import patches, sky_lights, sky_size
 from reconstruct.render.g_buffer import Interreflection, RenderView
 from reconstruct.render.receivers import Receivers, across, disc
@@ -272,20 +270,6 @@ def shadow_picture(view: RenderView, calibration: Calibration, photo: str) -> Fl
     """Return 1 at the view's pixels where light of one photo arrives, 0 where none does."""
     share = torch.stack([lit_share(view, light) for light in _lights_of(calibration, photo)]).amax(0)
     return share[..., None].expand(*share.shape, 3)
-
-
-def with_refined_lights(calibration: Calibration, fields: SolvedScene) -> Calibration:
-    """Return the calibration with the lights refined by the solve."""
-    used = [i for i, light in enumerate(calibration.lights) if light.used]
-    if fields.lights is None or len(used) != len(fields.lights):
-        return calibration
-    lights = list(calibration.lights)
-    for i, now in zip(used, fields.lights.double().numpy()[:, :3], strict=True):
-        if not lights[i].sigma.any():
-            continue  # it is known, and stays as it is stored
-        is_point = lights[i].position is not None
-        lights[i] = replace(lights[i], **{"position": now} if is_point else {"direction": now / np.linalg.norm(now)})
-    return replace(calibration, lights=tuple(lights))
 
 
 def _lights_of(calibration: Calibration, photo: str) -> list[Light]:

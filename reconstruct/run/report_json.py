@@ -44,16 +44,16 @@ def summary(
 ) -> dict[str, Any]:
     """Return the content of report.json: costs, photos used and dropped, residuals, versions."""
     calibration, check, plan = calibrated.first, run.file(CHECK), read_kept(run.file(PLAN), Plan)
-    residuals, trial = plain(calibration.residuals), solved.light_trial
     views = {view.name: view.calibration for view in calibrated.every()}
     notes, warnings = (_said(calibrated, key) for key in ("notes", "warnings"))
     names = {calibrated.views[0].name, *(view.view for view in solved.views())}
+    lights = sum(x.used for name, one in views.items() if name in names for x in one.lights)
     after = [
         *plain(warnings),
         *(reason for _, reason in calibrated.left_out),
         *([plan.sentence] if plan and OVERRIDE in plan.sentence else []),
         *solved.doubts,
-        *pieces(mesh, solved),
+        *pieces(mesh, solved, lights),
         *guessed(mesh),
         *undersides(mesh, solved),
         *_requests(run),
@@ -74,15 +74,13 @@ def summary(
             for name, one in views.items()
             for row in _photos(one, name if len(views) > 1 else "", len(views) == 1 or name in names)
         ],
-        "calibration": residuals,
+        "calibration": plain(calibration.residuals),
         **_of_views(calibrated, solved),
         "assumptions": plain(notes),
         "verdict": in_one_sentence(grade, warnings),
         "grade": grade,
         "warnings": warnings,
         "fit": fit,
-        "refined_lights": plain(_refined_lights(calibration, solved)),
-        "light_trial": trial and {"accepted": trial.is_accepted, "sentence": trial.sentence()} | asdict(trial),
         "mesh": {
             "size": mesh.extents.tolist(),
             "faces": len(mesh.faces),
@@ -147,7 +145,6 @@ def _of_views(calibrated: CalibratedViews, solved: SolvedScene) -> dict[str, Any
     for view in every:
         row: dict[str, Any] = {"name": view.name, "calibration": view.calibration.residuals}
         if view.name in found:
-            row["refined_lights"] = _refined_lights(view.calibration, found[view.name])
             motion = found[view.name].object_from_world
             if motion is not None:
                 row["object_from_world"] = motion.matrix()
@@ -197,24 +194,6 @@ def _requests(run: RunFolder) -> list[str]:
     return [text for i, text in said if i > last or "goes on from here" not in text]
 
 
-def _refined_lights(calibration: Calibration, solved: SolvedScene) -> list[dict[str, Any]]:
-    """Return each uncertain light after the solve, and its distance from its calibrated position or direction.
-
-    `moved` is in units of the calibration (radians for a direction); `sigmas` is `moved` over the norm of `sigma`.
-    """
-    if solved.lights is None:
-        return []
-    rows = []
-    lights = [light for light in calibration.lights if light.used]
-    for light, now in zip(lights, solved.lights.double().numpy(), strict=True):
-        by = float(np.linalg.norm(now[:3] - light.homogeneous()[:3]))
-        if light.sigma.any():
-            key = "direction" if light.position is None else "position"
-            row = {"photo": light.photo, key: now[:3], "moved": by, "sigma": light.sigma}
-            rows.append(row | {"sigmas": by / float(np.linalg.norm(light.sigma))})
-    return rows
-
-
 def misfit(numbers: dict[str, float]) -> list[str]:
     """Return warnings if the surface does not explain shadows that were held out from the fit, or the shading."""
     error, found = numbers.get("loss_held_out", 0.0), []
@@ -235,8 +214,12 @@ def misfit(numbers: dict[str, float]) -> list[str]:
     return found
 
 
-def pieces(mesh: trimesh.Trimesh, solved: SolvedScene) -> list[str]:
-    """Return a warning if the mesh falls into pieces that hang in the air; without ground, into pieces at all."""
+def pieces(mesh: trimesh.Trimesh, solved: SolvedScene, lights: int) -> list[str]:
+    """Return a warning if the mesh falls into pieces that hang in the air; without ground, into pieces at all.
+
+    Args:
+        lights: how many were used.
+    """
     parts = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)))
     if len(parts) < 2:
         return []
@@ -245,11 +228,9 @@ def pieces(mesh: trimesh.Trimesh, solved: SolvedScene) -> list[str]:
     in_the_air = lows > solved.ground_height + IN_THE_AIR * solved.grid.spacing
     if not in_the_air.any() or (in_the_air.all() and areas.max() >= LARGEST_PART * areas.sum()):
         return []
-    lights = [view.lights for view in solved.views() if view.lights is not None]
-    count = sum(map(len, lights))
     why = (
-        f"{count} photos leave open how far away some parts are. A few more, lit from other sides, would tell."
-        if lights and count < FEW_LIGHTS
+        f"{lights} photos leave open how far away some parts are. A few more, lit from other sides, would tell."
+        if lights < FEW_LIGHTS
         else "shadows that contradict each other carve an object into crumbs. Look at the lights in report.html."
     )
     return [f"the mesh falls into {len(parts)} pieces, {in_the_air.sum()} of them in the air: {why}"]

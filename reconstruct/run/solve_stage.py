@@ -81,7 +81,7 @@ def joined_object_poses(
         return scenes, None, ()
     together = _SmallSolves(run, report, device, config.seed).laid_together(scenes, object_poses)
     scenes, doubts = joined_scenes(scenes, object_poses, together.placed), tuple(text for _, text in together.refused)
-    start = begun(together.start, min(1, len(config.levels) - 1), scenes) if together.placed else None
+    start = begun(together.start, min(1, len(config.levels) - 1)) if together.placed else None
     return scenes, start, doubts
 
 
@@ -158,10 +158,10 @@ class _SmallSolves:
         return found
 
     def _all(self, scenes: Scenes, start: SdfGrid, attempt: int) -> SdfGrid:
-        """Return the small surface of the first pose and those that were placed; no trial of lights."""
+        """Return the small surface of the first pose and those that were placed."""
         _, config = preset(SMALL, self.seed)
         path = self.run.file(f"{KEPT_OBJECT_POSE}_all_{attempt}.safetensors")
-        earlier, part = begun(start, len(config.levels) - 1, scenes), _part("all object poses, small", self.report)
+        earlier, part = begun(start, len(config.levels) - 1), _part("all object poses, small", self.report)
         return fit_surface(scenes, config, part, path, self.device, earlier, self.run.activity)
 
 

@@ -358,43 +358,33 @@ def march(phi, origins, lights, far, s, jitter, rays, found, start, stop):
 
 
 @njit(**INNER)
-def _scatter_extremum(phi, sums, band, origin, ray, t, part, back, light):
-    """Scatter the slope `part` at one point of a ray; add what moves the ray's start to back, and its light to light.
-
-    A point light's gradient is by its position, a directional one's by its direction; light[4] gets |part|.
-    """
+def _scatter_extremum(phi, sums, band, origin, ray, t, part, back):
+    """Scatter the slope `part` at one point of a ray, and add what moves the ray's start to back."""
     x, y, z = origin[0] + t * ray[0], origin[1] + t * ray[1], origin[2] + t * ray[2]
     _scatter(phi, sums, band, x, y, z, part)
     gx, gy, gz = _gradient(phi, x, y, z)
-    along = t / ray[3] if ray[3] < FAR else t  # this point's shift if the light moves by 1
-    rest = 1 - along if ray[3] < FAR else 1.0
+    rest = 1 - t / ray[3] if ray[3] < FAR else 1.0  # this point's shift if the start moves by 1
     back[0] += part * gx * rest
     back[1] += part * gy * rest
     back[2] += part * gz * rest
-    light[0] += part * gx * along
-    light[1] += part * gy * along
-    light[2] += part * gz * along
-    light[4] += abs(part) * along
 
 
 @njit(**UNCOUNTED)
-def scatter_march(phi, sums, band, s, of_log, of_least, origins, rays, found, back, light, start, stop):
+def scatter_march(phi, sums, band, s, of_log, of_least, origins, rays, found, back, start, stop):
     """Scatter the gradient of marched rays, given d loss / d log T and, of rays without minima, d loss / d least SDF.
 
-    back and light get the gradients by a ray's start and its light, see _scatter_extremum.
+    back gets the gradient by a ray's start.
     """
     count, _, best, lows, highs = found
     for r in range(start, stop):
         for a in range(3):
             back[r, a] = 0.0
-        for a in range(5):
-            light[r, a] = 0.0
         if count[r] == 0 and of_least[r] != 0:
-            _scatter_extremum(phi, sums, band, origins[r], rays[r], best[r, 0], of_least[r], back[r], light[r])
+            _scatter_extremum(phi, sums, band, origins[r], rays[r], best[r, 0], of_least[r], back[r])
         for m in range(count[r]):
             low = of_log[r] * s * _phi_of(-s * lows[r, m, 1])
             if not abs(low) < LEAST_SLOPE:
-                _scatter_extremum(phi, sums, band, origins[r], rays[r], lows[r, m, 0], low, back[r], light[r])
+                _scatter_extremum(phi, sums, band, origins[r], rays[r], lows[r, m, 0], low, back[r])
             high = -of_log[r] * s * _phi_of(-s * highs[r, m, 1])
             if highs[r, m, 0] > 0 and not abs(high) < LEAST_SLOPE:
-                _scatter_extremum(phi, sums, band, origins[r], rays[r], highs[r, m, 0], high, back[r], light[r])
+                _scatter_extremum(phi, sums, band, origins[r], rays[r], highs[r, m, 0], high, back[r])

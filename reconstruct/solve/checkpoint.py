@@ -24,18 +24,16 @@ from torch import Tensor
 from capture.errors import ReconstructionError, Remedy
 from capture.files.atomic import atomic_file
 from capture.files.regular import why
-from reconstruct.fields import Verdict
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import thread_count
 from reconstruct.solve.early_stopping import EarlyStopping
-from reconstruct.solve.light_refine import LightShift
 from reconstruct.tensor_file import Layout, StoredTensors, parsed, read_tensors, write_tensors
 from reconstruct.views import Scenes, each
 
 CHECKSUM, FORMAT, FINGERPRINT = "checksum", "format", "fingerprint"
 Log = Callable[[str], None]
-VERSION = "9"
+VERSION = "10"
 FINGERPRINTED = (
     "rgb",
     "shadow",
@@ -155,13 +153,10 @@ class SolveState:
     start: SdfGrid  # the surface when this level began: its labels were computed with it
     phi: np.ndarray  # voxels, of this level's grid; empty when iteration is 0
     wrong: np.ndarray  # running tables of the Supervision of all views, flat; empty when iteration is 0
-    start_shift: LightShift  # of the lights when this level began: its labels were computed under them
-    shift: LightShift
     stopping: EarlyStopping  # of this level
     origin: np.ndarray  # of this level's grid, world, bit-exact; that of `start` when iteration is 0
     spacing: float
     began_with: str  # name of the Start that made the first surface: a resumed solve tries no other
-    verdict: Verdict | None = None  # on the lights, at the end of an earlier level
     left_out: tuple[int, ...] = ()  # photos whose rays gave non-finite numbers
 
 
@@ -195,8 +190,6 @@ def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
         "phi": torch.from_numpy(state.phi),
         "phi_origin": torch.from_numpy(np.asarray(state.origin, np.float64)),
         "wrong": torch.from_numpy(state.wrong),
-        "start_shift": torch.from_numpy(np.stack([state.start_shift.shift, state.start_shift.pull])),
-        "shift": torch.from_numpy(np.stack([state.shift.shift, state.shift.pull])),
         "held_out": torch.tensor(state.stopping.errors, dtype=torch.float64),
     }
     if state.stopping.best is not None:
@@ -204,7 +197,6 @@ def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
         tensors |= {"best": best.values.contiguous(), "best_origin": best.origin.contiguous()}
     header: dict[str, Any] = {"level": state.level, "iteration": state.iteration, "spacing": state.start.spacing}
     header |= {"phi_spacing": state.spacing, "began_with": state.began_with, "left_out": state.left_out}
-    header["verdict"] = None if state.verdict is None else asdict(state.verdict)
     if state.stopping.best is not None:
         header["best_spacing"] = state.stopping.best.spacing
     write_checkpoint(tensors, {FORMAT: VERSION, FINGERPRINT: fingerprint, "state": json.dumps(header)}, path)
@@ -238,13 +230,10 @@ def _state(tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> SolveStat
         SdfGrid(tensors["start"], tensors["origin"], float(state["spacing"])),
         tensors["phi"].numpy(),
         tensors["wrong"].numpy(),
-        LightShift(*tensors["start_shift"].numpy()),
-        LightShift(*tensors["shift"].numpy()),
         _stopping(tensors, state),
         tensors["phi_origin"].numpy(),
         float(state["phi_spacing"]),
         str(state["began_with"]),
-        None if state["verdict"] is None else Verdict(**state["verdict"]),
         tuple(int(photo) for photo in state["left_out"]),
     )
 

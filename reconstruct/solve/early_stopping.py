@@ -56,7 +56,7 @@ class StepGuard:
         if not terms:
             self._in_a_row, self._photos = 0, set()
             return losses
-        faulty = self._ray_passes.forget()
+        faulty = self._ray_passes.faulty()
         self._surface.forget()
         self._in_a_row += 1
         self._photos |= set(faulty)

@@ -1,4 +1,4 @@
-"""One level of a solve: move the surface, and uncertain lights, along the gradients of the rays.
+"""One level of a solve: move the surface along the gradients of the rays.
 
 Requests of page visitors to a solve: pause, next level, stop, resolution. They act where a solve can be resumed.
 
@@ -16,7 +16,6 @@ from reconstruct.scene import Scene
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.solve.checkpoint import SolveState
 from reconstruct.solve.early_stopping import REST, EarlyStopping, StepGuard
-from reconstruct.solve.light_refine import MovingLights, lit_from
 from reconstruct.solve.operators import JointPasses
 from reconstruct.views import Scenes, each, photo_names, placed
 
@@ -93,44 +92,37 @@ class LevelFit:
     log: Callable[[str], None] = lambda _: None  # called with a sentence for every step that is skipped
 
     def steps(
-        self, surface: LevelSet, lights: MovingLights, done: int = 0, stopping: EarlyStopping = NO_ERRORS_YET
+        self, surface: LevelSet, done: int = 0, stopping: EarlyStopping = NO_ERRORS_YET
     ) -> Iterator[tuple[int, dict[str, float], EarlyStopping]]:
         """Run iterations done .. level.iterations - 1 and yield each one's number, mean errors and held-out errors.
 
         Args:
-            lights: they move with the surface, if they are uncertain.
             stopping: the errors of the held-out rays so far.
 
         Raises:
             NotFiniteError: too many steps in a row had to be skipped.
         """
         level, config = self.level, self.config
-        scenes = each(self.scenes)
-        ray_pass = JointPasses(surface, placed(scenes), each(self.rays), config)
-        guarded = StepGuard(ray_pass, surface, photo_names(scenes), self.log)
-        if lights.are_free or lights.shift.shift.any():
-            ray_pass.move_lights(lights.in_grid(surface.origin, surface.spacing))
+        scenes = placed(self.scenes)
+        ray_pass = JointPasses(surface, each(scenes), each(self.rays), config)
+        guarded = StepGuard(ray_pass, surface, photo_names(each(scenes)), self.log)
         for i in range(done, level.iterations):
             share = stopping.share(i, level.iterations)
             if share > 1 + 1e-9:
                 return
             if i == done or i % LOOK_EVERY == 0:
-                lit = placed(lit_from(scenes, lights.shift))
                 motion = HORIZON * _between(level.rate, share)
-                ray_pass.look(surface.grid(), lit, self.first + i, _between(config.sharpness, share), motion)
+                ray_pass.look(surface.grid(), self.first + i, _between(config.sharpness, share), motion)
             losses = guarded(self.first + i, _between(config.sharpness, share))
             if losses is not None:
                 passes = max(1, round(level.blur * (1 - share) + share))
                 rate = _between(level.rate, share)
                 surface.step(passes, rate, level.shrink, config.curvature, config.stiffness, config.smoothing)
-                if lights.are_free:
-                    lights.follow(ray_pass.light_gradient(), rate, self.first + i)
-                    ray_pass.move_lights(lights.in_grid(surface.origin, surface.spacing))
             losses = losses or {}
             if is_rest(i, level):
                 surface.redistance()
                 now = surface.grid()
-                losses |= {"held_out": self.held_out.error(now, placed(lit_from(self.scenes, lights.shift)))}
+                losses |= {"held_out": self.held_out.error(now, scenes)}
                 stopping = stopping.after(losses["held_out"], now)
             yield i, losses, stopping
 

@@ -15,7 +15,7 @@ from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import lights_to_grid, to_grid
 from reconstruct.sdf.settled import Tiles, Views, unsettled_rays, unsettled_views
 from reconstruct.solve.ray_operators import DrawnRays, RayOperators, Sums
-from reconstruct.views import Scenes, by_scene, first_photos
+from reconstruct.views import Scenes, first_photos
 
 FEWEST_RAYS = 20_000  # weight of all shadow rays in an iteration, at least: of few pixels, too
 AGREES = 6.0  # s times the SDF at which T is within 0.0025 of 0 or 1
@@ -40,17 +40,16 @@ class RayPasses:
         self.sums: dict[str, Sums] = {}  # of the last call, by name
         self.shadow_rays, self.camera_rays = _NO_RAYS, _NO_RAYS
 
-    def look(self, surface: SdfGrid, scene: Scene, iteration: int, sharpness: float, motion: float) -> None:
+    def look(self, surface: SdfGrid, iteration: int, sharpness: float, motion: float) -> None:
         """Choose the rays of the iterations until the next look.
 
         Args:
             surface: a distance function.
-            scene: with the lights as they are now.
             iteration: of the whole solve; with the seed it determines which pixels a coarse grid looks at.
             sharpness: least NeuS s per voxel until then.
             motion: voxels that the surface may move until then: rays that come within reach are chosen, too.
         """
-        rays, need = self.rays, AGREES / sharpness + motion
+        scene, rays, need = self.scene, self.rays, AGREES / sharpness + motion
         field, views = surface.blocks, views_in_grid(surface, scene, rays)
         lights = lights_to_grid(surface, scene.lights)
         enough = share_of_pixels(field, views)
@@ -120,13 +119,8 @@ class RayPasses:
         again[~(self.shadow_rays.misses > kernels.WRONG)] = 0
         self.rays.wrong[photo, pixel] = again
 
-    def forget(self) -> list[int]:
-        """Drop the last call's light gradient.
-
-        Returns:
-            The photos whose shadow rays gave non-finite values.
-        """
-        self.operators.light_gradient()
+    def faulty(self) -> list[int]:
+        """Return the photos whose shadow rays gave non-finite values in the last call."""
         return np.unique(self.shadow_rays.places[~np.isfinite(self.shadow_rays.misses), 0]).tolist()
 
 
@@ -137,10 +131,10 @@ class JointPasses:
         self._scenes = scenes
         self.passes = tuple(RayPasses(surface, *view, config) for view in zip(scenes, rays, strict=True))
 
-    def look(self, surface: SdfGrid, scenes: Scenes, iteration: int, sharpness: float, motion: float) -> None:
+    def look(self, surface: SdfGrid, iteration: int, sharpness: float, motion: float) -> None:
         """Choose the rays of all views until the next look, see RayPasses.look."""
-        for one, scene in zip(self.passes, scenes, strict=True):
-            one.look(surface, scene, iteration, sharpness, motion)
+        for one in self.passes:
+            one.look(surface, iteration, sharpness, motion)
 
     def __call__(self, iteration: int, sharpness: float) -> dict[str, float]:
         """Cast the rays of all views and return the mean errors by name, see RayPasses.__call__."""
@@ -149,19 +143,10 @@ class JointPasses:
         every = [one.sums for one in self.passes]
         return _means({name: (sum(s[name][0] for s in every), sum(s[name][1] for s in every)) for name in every[0]})
 
-    def move_lights(self, lights: Float[np.ndarray, "photos 4"]) -> None:
-        """Set the lights of all further rays; homogeneous, grid frame."""
-        for one, own in zip(self.passes, by_scene(self._scenes, lights), strict=True):
-            one.operators.move_lights(own)
-
-    def light_gradient(self) -> Float[np.ndarray, "photos 4"]:
-        """Return the lights' gradient since the last call, see RayOperators."""
-        return np.concatenate([one.operators.light_gradient() for one in self.passes])
-
-    def forget(self) -> list[int]:
-        """Drop the last call's light gradients; return the photos whose shadow rays gave non-finite values."""
+    def faulty(self) -> list[int]:
+        """Return the photos whose shadow rays gave non-finite values in the last call, numbered through all views."""
         first = first_photos(self._scenes)
-        return [start + photo for start, one in zip(first, self.passes, strict=True) for photo in one.forget()]
+        return [start + photo for start, one in zip(first, self.passes, strict=True) for photo in one.faulty()]
 
 
 def _means(sums: Mapping[str, Sums]) -> dict[str, float]:

@@ -32,7 +32,7 @@ def ray_counts(
     scenes, rays = each(scenes), each(rays)
     passes = JointPasses(surface, scenes, rays, config)
     first = sum(level.iterations for level in config.levels)
-    passes.look(grid, scenes, first, SHARPNESS, 0.0)
+    passes.look(grid, first, SHARPNESS, 0.0)
     passes(first, SHARPNESS)
     count = surface.sums()[1]
     labels = float(sum((part.confidence > kernels.NO_WEIGHT).sum() for part in rays))

@@ -37,7 +37,7 @@ class DrawnRays:
 
 
 class RayOperators:
-    """Losses of one level's rays, and their gradients with respect to the surface and the lights, in one pass.
+    """Losses of one level's rays, and their gradients with respect to the surface, in one pass.
 
     Gradients are added up on the surface, divided by NeuS s and so in voxels, until its next step. `iteration` is of
     the whole solve: with the seed it determines every random number. `sharpness` is NeuS s per voxel.
@@ -51,8 +51,7 @@ class RayOperators:
         eye = ((scene.eye.double() - origin) / surface.spacing).numpy()
         ground_t = np.where(np.isfinite(rays.ground_t), rays.ground_t / surface.spacing, NEVER)
         self.eye, self.ground_t = self._moved(eye), self._moved(ground_t)
-        self.lights = torch.empty(0)
-        self.move_lights(lights_in_frame(scene.lights.double(), origin, surface.spacing).numpy())
+        self.lights = self._moved(lights_in_frame(scene.lights.double(), origin, surface.spacing))
         self.directions, self.role = self._moved(rays.directions), self._moved(rays.role)
         self.label = torch.from_numpy(rays.label).to(self.device)
         self.width = float(scene.pixel_angle)
@@ -90,7 +89,7 @@ class RayOperators:
         covered = self._moved(self.rays.mask)
         for pixel, weight, first in zip(*(x.split(BATCHES.rays) for x in given), strict=True):
             label, start = 1 - covered[pixel], self.eye.expand(len(pixel), 3)
-            towards = torch.cat([self.directions[pixel], self.eye.new_zeros(len(pixel), 2)], 1)
+            towards = torch.cat([self.directions[pixel], self.eye.new_zeros(len(pixel), 1)], 1)
             log_seen, clear = self.field.march(start, towards, sharpness, first, self.ground_t[pixel])
             loss = cross_entropy(log_seen.exp(), -log_seen.expm1(), label) / sharpness + (1 - label) * clear
             (weight @ loss).backward()
@@ -108,24 +107,6 @@ class RayOperators:
             sums += torch.stack([error.detach(), weight.sum()])
         return float(sums[0]), float(sums[1])
 
-    def light_gradient(self) -> Float[np.ndarray, "photos 4"]:
-        """Return the gradient of the shadow rays since the last call, and the sum of its magnitudes over rays.
-
-        The gradient is with respect to each light's homogeneous x, y, z, grid frame.
-        """
-        left = self.lights.grad
-        total = torch.zeros_like(self.lights) if left is None else left
-        self.lights.grad = None
-        return total[:, [0, 1, 2, 4]].cpu().numpy()
-
-    def move_lights(self, lights: Float[np.ndarray, "photos 4"]) -> None:
-        """Set the lights of all further rays; homogeneous, grid frame."""
-        left = self.lights.grad
-        given = torch.cat([torch.from_numpy(lights), torch.zeros(len(lights), 1, dtype=torch.float64)], 1)
-        # The fifth number is 0, and gets the sum of the gradient's sizes.
-        self.lights = given.to(self.device).requires_grad_()
-        self.lights.grad = left
-
     # --- parts of the operators ---------------------------------------------------------------------------------------
 
     def _shadow_batch(
@@ -136,7 +117,7 @@ class RayOperators:
         jitter: Float[Tensor, "n 2"],
         s: float,
     ) -> Float[Tensor, " n"]:
-        """Return |C - label| of some drawn rays, and add their gradients to the surface and the lights.
+        """Return |C - label| of some drawn rays, and add their gradients to the surface.
 
         A boundary pixel mixes two rays, C = w T_near + (1 - w) T_far [ShadowNeuS eq:edge_vis].
         """
@@ -149,9 +130,8 @@ class RayOperators:
         start, is_away = self._starts(pixel, share.detach(), photo, label)
         # The far ray of each pixel, then the near ones: marched together, they cost a device one march.
         starts, photos = torch.cat([start, silhouette]), torch.cat([photo, photo[edge]])
-        lights = self.lights.index_select(0, photos)
         first, parts = torch.cat([jitter[:, 0], jitter[edge, 1]]), [len(start), len(silhouette)]
-        log_t, least = self.field.march(starts, lights, s, first)
+        log_t, least = self.field.march(starts, self.lights[photos], s, first)
         (lost_far, lost_near), (clear_far, clear_near) = log_t.split(parts), least.split(parts)
         # A surface that faces away is dark by max(n . l, 0); its ray would pass a thin slice only and make a bulge.
         lit = torch.where(is_away, 0.0, share)
@@ -179,7 +159,7 @@ class RayOperators:
         end = torch.where(is_hit, self.hit[pixel], self.ground_t[pixel])
         start = self.eye + end[:, None] * self.directions[pixel]
         hit = is_hit.nonzero()[:, 0]
-        points, lights = start[hit], self.lights.detach()[photo[hit]].to(self.field.real)
+        points, lights = start[hit], self.lights[photo[hit]]
         normals = self.field.gradient(points)
         faces_away = (normals * (lights[:, :3] - lights[:, 3:4] * points)).sum(-1) < 0
         away = torch.zeros_like(is_hit).index_put((hit,), faces_away & (label[hit] < 0.5))

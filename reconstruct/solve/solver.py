@@ -26,9 +26,8 @@ from reconstruct.sdf.normal_fusion import combine_with_normals
 from reconstruct.solve.checkpoint import CheckpointWriter, SolveState, fingerprint, load_state, save_state
 from reconstruct.solve.early_stopping import EarlyStopping, NotFiniteError
 from reconstruct.solve.level import LevelFit, NoSteering, Rescheduled, Steering, is_rest
-from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift
 from reconstruct.solve.ray_counts import ray_counts
-from reconstruct.solve.trials import before_trial, hull_is_better, shadow_doubts, try_lights
+from reconstruct.solve.trials import hull_is_better, shadow_doubts
 from reconstruct.solve.unseen import without_unsupported_matter
 from reconstruct.torch_sdf.rays import BATCHES
 from reconstruct.views import Scenes, check_common, each, first_photos, photo_names, placed
@@ -37,7 +36,6 @@ SHOW_EVERY_S = 2.0  # between surfaces handed to the report
 SHARE_OF_SHOWING = 0.02  # of a core's time
 SAVE_EVERY_S = 5.0  # between checkpoints: what a kill may cost
 NO_STEERING = NoSteering()
-TRIALS = 2  # of moved lights: later levels start near the truth, and a rejected light's traces would outlast them
 FEWEST_PHOTOS = 4  # below, shadows leave most of the shape open
 SEED_OF_VIEWS = 1000  # of the rays held out from further views, beside the seed
 
@@ -64,9 +62,7 @@ def fit(
 
     1. Every pixel is tested against the known ground. 2. Lit ground carves the shadow hull. 3. On finer and finer
     grids, labels are recomputed with the current surface, and the surface moves until its shadow rays agree. 4. Its
-    unevenness follows the normals of the last level's labels, see `combine_with_normals`. Lights that the scene marks
-    as uncertain move with it; each level computes its labels under the current lights. The lights are tried at the end
-    of the first levels, until they explain held-out rays better than the calibrated ones.
+    unevenness follows the normals of the last level's labels, see `combine_with_normals`. Lights stay as calibrated.
 
     Args:
         scene: what one camera sees, or what each of several does: one surface is solved from all.
@@ -103,8 +99,7 @@ def fit_steered(
     if isinstance(solved, Rescheduled):
         return solved
     say("reading albedo and gloss from the photos, and comparing each light with the shadows under the others")
-    found = _fields(solved.observers, solved.lit, solved.rays, solved.begin, solved.surface)
-    return as_stored(replace(found, light_trial=solved.state.verdict))
+    return as_stored(_fields(solved))
 
 
 def fit_surface(
@@ -131,11 +126,10 @@ class _Solved:
     """The end of a solve's last level."""
 
     observers: tuple[Observer, ...]
-    lit: Scenes  # under the lights as the solve left them
+    scenes: Scenes  # with the ground that the first surface stands on
     rays: tuple[Supervision, ...]  # of the last level
     begin: Start
     surface: SdfGrid
-    state: SolveState
 
 
 def _solved(
@@ -155,7 +149,7 @@ def _solved(
     mark = fingerprint(scenes, config)  # without the device: either backend goes on where the other was stopped
     state = (load_state(checkpoint, mark, _log_to(report, "hull")) if checkpoint else None) or earlier
     begin = choose_start(scenes, observers, config, say, hull_is_better, state.began_with if state else "")
-    state = state or _first_state(begin, scenes, mark, checkpoint, report)
+    state = state or _first_state(begin, mark, checkpoint, report)
     origin, scenes = state.start, begin.standing(scenes, state.start)
     task = _Task(scenes, begin, device, report, _log_to(report, "solve"), say, _Timer(SHOW_EVERY_S), steering)
     with CheckpointWriter(state, checkpoint, mark, SAVE_EVERY_S) as writer:
@@ -176,21 +170,19 @@ def _solved(
             if state.level == len(begin.config.levels):
                 break
             writer.keep(state)
-    lit = lit_from(scenes, state.shift)
     assert rays is not None  # the loop ends after a level
-    normals = [normal_rays(scene, own) for scene, own in zip(placed(lit), rays, strict=True)]
-    surface = combine_with_normals(begin.better(origin, state.start, lit), normals)
-    return _Solved(observers, lit, rays, begin, surface, state)
+    normals = [normal_rays(scene, own) for scene, own in zip(placed(scenes), rays, strict=True)]
+    surface = combine_with_normals(begin.better(origin, state.start, scenes), normals)
+    return _Solved(observers, scenes, rays, begin, surface)
 
 
-def _fields(
-    observers: tuple[Observer, ...], scenes: Scenes, rays: tuple[Supervision, ...], begin: Start, found: SdfGrid
-) -> SolvedScene:
+def _fields(end: _Solved) -> SolvedScene:
     """Return the solved scene: a surface, its material as all views show it, and the rays that hold it."""
-    solved = join_views([observer.fields(found, scene) for observer, scene in zip(observers, scenes, strict=True)])
-    evidence = ray_counts(placed(scenes), rays, solved.grid, begin.config)
-    doubts = (*begin.doubts(scenes), *shadow_doubts(scenes, observers, rays, solved.grid))
-    return replace(solved, evidence=evidence, doubts=doubts)
+    views = zip(end.observers, end.scenes, strict=True)
+    solved = join_views([observer.fields(end.surface, scene) for observer, scene in views])
+    evidence = ray_counts(placed(end.scenes), end.rays, solved.grid, end.begin.config)
+    doubts = shadow_doubts(end.scenes, end.observers, end.rays, solved.grid)
+    return replace(solved, evidence=evidence, doubts=(*end.begin.doubts(), *doubts))
 
 
 @dataclass(frozen=True)
@@ -207,9 +199,9 @@ class _Task:
     steering: Steering
 
 
-def _first_state(begin: Start, scenes: Scenes, mark: str, checkpoint: Path | None, report: SolveReporter) -> SolveState:
+def _first_state(begin: Start, mark: str, checkpoint: Path | None, report: SolveReporter) -> SolveState:
     """Return the state that a solve begins with, stored at once: a hull under many lights takes minutes."""
-    state = _fresh(0, _first_surface(begin, report), no_shift(scenes), begin.name)
+    state = _fresh(0, _first_surface(begin, report), begin.name)
     if checkpoint is not None:
         save_state(state, mark, checkpoint)
     return state
@@ -236,58 +228,29 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, tup
     level = config.levels[state.level]
     first, total = (sum(x.iterations for x in levels) for levels in (config.levels[: state.level], config.levels))
     task.say(f"reading shadows and slopes from the photos for round {state.level + 1} of {len(config.levels)}")
-    labels = begin.labels(state.start, lit_from(scenes, state.start_shift))
+    labels = begin.labels(state.start, scenes)
     start, rays = _resumed(state, scenes, labels, level)
     rays, held_out = _held_out(scenes, rays, config)
     _leave_out(state.left_out, scenes, rays)
-    surface = start.on(task.device)
-    is_tried, is_accepted = _is_tried(state, scenes, config), state.verdict is not None and state.verdict.is_accepted
-    lights, stopping = MovingLights(scenes, state.shift, is_tried or is_accepted), state.stopping
-    free = before_trial(level) if is_tried else level
-    level_fit = LevelFit(scenes, rays, held_out, free, config, first, task.log)
-    for i, losses, stopping in level_fit.steps(surface, lights, state.iteration, state.stopping):
+    surface, stopping = start.on(task.device), state.stopping
+    level_fit = LevelFit(scenes, rays, held_out, level, config, first, task.log)
+    for i, losses, stopping in level_fit.steps(surface, state.iteration, state.stopping):
         began, shown = time.thread_time(), surface.grid() if task.show.is_due() else None
         message = f"round {state.level + 1} of {len(config.levels)}, {level.nodes} steps along the object"
         task.report(stage="solve", done=first + i + 1, total=total, message=message, numbers=losses, surface=shown)
         if shown is not None:
             task.show.shown(time.thread_time() - began)
-        if is_rest(i, free):
+        if is_rest(i, level):
             tables = {"phi": surface.phi, "wrong": np.concatenate([own.wrong.ravel() for own in rays])}
             place = {"origin": surface.origin, "spacing": surface.spacing}
-            writer.keep(replace(state, iteration=i + 1, **tables, **place, shift=lights.shift, stopping=stopping))
+            writer.keep(replace(state, iteration=i + 1, **tables, **place, stopping=stopping))
             if task.steering.ends_level():
                 break
         task.steering.wait(writer.write)
-    found, shift, verdict = stopping.chosen(surface.grid()), lights.shift, state.verdict
-    if is_tried:
-        task.say("comparing the moved lights with the first ones")
-        unmoved = no_shift(scenes)
-        verdict, found = try_lights(replace(level_fit, level=level), found, shift, unmoved, task.device)
-        shift = shift if verdict.is_accepted else unmoved
-        said = {"message": verdict.sentence(), "numbers": {}, "surface": None}
-        task.report(stage="solve", done=first + level.iterations, total=total, **said)
+    found = stopping.chosen(surface.grid())
     if state.level == 0 and len(config.levels) > 1:
-        found = without_unsupported_matter(found, placed(lit_from(scenes, shift)), rays)
-    after = _fresh(state.level + 1, found, shift, state.began_with)
-    return replace(after, left_out=state.left_out, verdict=verdict), rays
-
-
-def _is_tried(state: SolveState, scenes: Scenes, config: FitConfig) -> bool:
-    """Return whether uncertain lights move in this level and are tried at its end.
-
-    They do until accepted, in the first TRIALS levels, but not in the finest of several: if they are rejected, its
-    surface is then the same as if they had never moved.
-    """
-    are_known = not any(bool(scene.light_sigma.any()) for scene in scenes)
-    if not config.refine_lights or are_known or (state.verdict and state.verdict.is_accepted):
-        return False
-    done = sum(level.iterations for level in config.levels[: state.level])
-    is_last = 0 < state.level == len(config.levels) - 1
-    return (
-        state.level < TRIALS
-        and not is_last
-        and done + before_trial(config.levels[state.level]).iterations > FIRST_ITERATION
-    )
+        found = without_unsupported_matter(found, placed(scenes), rays)
+    return replace(_fresh(state.level + 1, found, state.began_with), left_out=state.left_out), rays
 
 
 def _last_good_state(state: SolveState, fault: NotFiniteError | torch.OutOfMemoryError, task: _Task) -> SolveState:
@@ -339,15 +302,15 @@ def _leave_out(photos: tuple[int, ...], scenes: Scenes, rays: tuple[Supervision,
         own.confidence[[k - first for k in photos if 0 <= k - first < len(own.confidence)]] = 0
 
 
-def begun(surface: SdfGrid, level: int, scenes: Scenes) -> SolveState:
+def begun(surface: SdfGrid, level: int) -> SolveState:
     """Return the state of a solve that begins with a known surface, at one of its levels."""
-    return _fresh(level, surface, no_shift(scenes), HULL)
+    return _fresh(level, surface, HULL)
 
 
-def _fresh(level: int, start: SdfGrid, shift: LightShift, began_with: str) -> SolveState:
+def _fresh(level: int, start: SdfGrid, began_with: str) -> SolveState:
     nothing, origin = np.zeros(0, np.float32), start.origin.double().numpy()
     tables = (nothing, nothing.astype(np.uint8))
-    return SolveState(level, 0, start, *tables, shift, shift, EarlyStopping(), origin, start.spacing, began_with)
+    return SolveState(level, 0, start, *tables, EarlyStopping(), origin, start.spacing, began_with)
 
 
 def _resumed(

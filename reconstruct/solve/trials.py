@@ -1,23 +1,19 @@
-"""What held-out shadow rays decide: refined lights or not, hull or height field, and whether a result is to be doubted.
+"""What held-out shadow rays decide: hull or height field, and whether a result is to be doubted.
 
 The start from shadow pictures alone. A height field holds no slats and no seat above legs; a hull holds no hollow that
 no shadow on the ground shows. Which of them an object needs is in the pictures, not in the camera's direction: both are
 made at a small size, the hull with the first level of the free surface, and the rays that neither has seen choose.
 """
 
-from dataclasses import replace
-
 import numpy as np
-import torch
 
 from capture.errors import ReconstructionError
 from reconstruct.config import FitConfig, Level
-from reconstruct.fields import Verdict
 from reconstruct.hull.shadow_hull import shadow_hull
 from reconstruct.initialization.height_field import HeightConfig, fit_heights
 from reconstruct.initialization.height_grid import height_grid
 from reconstruct.initialization.height_view import HeightView, height_view
-from reconstruct.labels.held_out import HeldOut, ValidationRays, draw_blocks, hold_out, without
+from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out, without
 from reconstruct.labels.labels import not_isolated
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.outline import wrong_labels
@@ -26,11 +22,8 @@ from reconstruct.scene import Scene, reduced
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
 from reconstruct.solve.level import LevelFit
-from reconstruct.solve.light_refine import LightShift, MovingLights, lit_from, no_shift
-from reconstruct.views import Scenes, each, placed
+from reconstruct.views import Scenes
 
-TRIAL = 8  # iterations, about a tenth of a level: at its last rate a surface moves by 1 to 3 voxels in them
-LARGEST_SHARE = 1 / 3  # of a level's iterations: short levels leave the lights time to move
 START_SIDE = 64  # px of the longer side in which both starts are made: a height field costs its third power
 START_LEVEL = Level(40, 24, (0.5, 0.4), 4, 4.2e-4)
 NODES_PER_PIXEL = 1.75  # of the height field's grid
@@ -39,52 +32,6 @@ START_SHARE = 0.05  # of all rays, single pixels
 CONTRADICTED = 0.04  # of the shadow that no fit has seen: right surfaces leave .001 to .012, a sheet for a chair .06
 FEWEST_DARK = 200  # labels that this share needs
 START_SHARPNESS = 4.0  # NeuS s per px of the ground, the same for both
-
-
-def before_trial(level: Level) -> Level:
-    """Return the level without the iterations of its trial."""
-    return replace(level, iterations=level.iterations - min(TRIAL, int(LARGEST_SHARE * level.iterations)))
-
-
-def try_lights(
-    fit: LevelFit, found: SdfGrid, shift: LightShift, unmoved: LightShift, device: torch.device | None
-) -> tuple[Verdict, SdfGrid]:
-    """Run a level's last iterations twice, with moved and unmoved lights; return the verdict and the better surface.
-
-    Both runs start from the surface solved under the moved lights and draw the same rays, so that random effects are
-    equal. The difference of their held-out errors is a weighted mean over photos; its noise follows from its variation
-    between photos [the ratio estimator of cluster sampling, Cochran 1977, 6.4].
-
-    Args:
-        fit: of the whole level, under the calibrated lights.
-        found: the surface at the end of before_trial(level).
-        unmoved: the shift of unmoved lights.
-
-    Raises:
-        NotFiniteError: see LevelFit.steps.
-    """
-    sides, errors = [], []
-    for lights in (unmoved, shift):
-        surface = resampled(found, fit.level.nodes).on(device)
-        own = replace(fit, rays=tuple(replace(rays, wrong=rays.wrong.copy()) for rays in each(fit.rays)))
-        for _ in own.steps(surface, MovingLights(fit.scenes, lights, False), before_trial(fit.level).iterations):
-            pass
-        sides.append(surface.grid())
-        errors.append(fit.held_out.errors(sides[-1], placed(lit_from(fit.scenes, lights))))
-    verdict = judge(fit.held_out, errors[0], errors[1], len(unmoved.shift))
-    return verdict, sides[int(verdict.is_accepted)]
-
-
-def judge(held_out: HeldOut | ValidationRays, calibrated: np.ndarray, refined: np.ndarray, n_photos: int) -> Verdict:
-    """Decide from the errors of every held-out ray. Without such rays, or with one photo, nothing is accepted."""
-    weight = np.bincount(held_out.photo, held_out.weight, n_photos)
-    before, after = (np.bincount(held_out.photo, held_out.weight * e, n_photos) for e in (calibrated, refined))
-    total, seen = float(weight.sum()), int((weight > 0).sum())
-    if seen < 2:
-        return Verdict(0.0, 0.0, 0.0)
-    difference = float((after - before).sum()) / total
-    spread = np.sqrt(seen / (seen - 1) * ((after - before - weight * difference) ** 2).sum()) / total
-    return Verdict(float(before.sum()) / total, float(after.sum()) / total, float(spread))
 
 
 def hull_is_better(scene: Scene, config: FitConfig) -> bool:
@@ -106,8 +53,7 @@ def hull_is_better(scene: Scene, config: FitConfig) -> bool:
     except ReconstructionError:
         return False
     surface = resampled(hull, START_LEVEL.nodes)
-    lights = MovingLights((small,), no_shift((small,)), False)
-    for _ in LevelFit(small, rays, held_out, START_LEVEL, config).steps(surface, lights):
+    for _ in LevelFit(small, rays, held_out, START_LEVEL, config).steps(surface):
         pass
     field = height_grid(fit_heights(view, HeightConfig(longest=START_SIDE)), small, round(NODES_PER_PIXEL * START_SIDE))
     free, heights = (_error(grid, small, held_out, view) for grid in (surface.grid(), field))

@@ -35,8 +35,8 @@ READING = 0.25e9  # bytes: before the solver is there
 PER_FULL_PIXEL = 90  # bytes, of the board's photo while its corners are found, and of the maps: a dozen float64
 PER_STORED_PIXEL = 13  # bytes in each photo of the stack, which is mapped: brightness, texture, texture moved back
 # Bytes in each photo at the solver's size. Photo 13, ground test 13, labels and their running errors 20; while they are
-# read again 18 more, and 35 where lights have moved and the ground is tested again beside all that: 64 and 81 were
-# measured, and which it will be is not known before.
+# read again 18 more, and 35 where the ground is tested again beside all that, as under several lights: 64 and 81 were
+# measured.
 PER_RAY = 72
 PER_SOLVED_PIXEL = 300  # bytes at the solver's size: nodes near the surface, normals, albedo, gloss
 MARGIN = 1.1  # of the prediction that must be available: its error is below a fifth, mostly below a tenth

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import UNSET, Meta, Struct, UnsetType
+from msgspec import Meta, Struct
 
 from calibration.calibrated_views import CalibratedView
 from capture.decode.formats import is_photo_name
@@ -43,20 +43,6 @@ class _Photo(Struct):
     reason: Text | None = None
 
 
-class _Refined(Struct):
-    photo: FileName
-    moved: Number
-    sigmas: Number
-    sigma: Vector
-    position: Vector | UnsetType = UNSET
-    direction: Vector | UnsetType = UNSET
-
-
-class _Trial(Struct):
-    sentence: Text
-    accepted: bool
-
-
 class _Share(Struct):
     share: Number
 
@@ -82,13 +68,7 @@ class _Report(Struct):
     stages: Annotated[dict[str, _Cost], Meta(max_length=MOST_STAGES)] | None = None
     fit: dict[str, Scalar] | None = None
     versions: Annotated[dict[str, Scalar], Meta(max_length=MOST_VERSIONS)] | None = None
-    light_trial: _Trial | None = None
-    refined_lights: Annotated[list[_Refined], Meta(max_length=MOST_PHOTOS)] | None = None
     mesh: _Mesh | None = None
-
-    def __post_init__(self) -> None:
-        if len({light.position is UNSET for light in self.refined_lights or ()}) > 1:
-            raise ValueError("refined_lights are of two kinds; needed: all with a position, or none")
 
 
 class _Manifest(Struct):

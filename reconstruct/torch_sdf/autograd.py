@@ -39,7 +39,6 @@ class Sample(torch.autograd.Function):
         values: Float[Tensor, "*nodes"],
         evidence: Float[Tensor, "*nodes"] | None,
         points: Float[Tensor, "n 3"],
-        sizes: Float[Tensor, " n"] | None,
         volume: Volume,
         quantum: float,
     ) -> Float[Tensor, " n"]:
@@ -51,9 +50,9 @@ class Sample(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Float[Tensor, " n"]) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the gradients to values, evidence, points and sizes."""
+        """Return the gradients to values, evidence and points."""
         (points,), volume, (slope,) = ctx.saved_tensors, ctx.volume, upstream
-        of_values, of_evidence, of_points, of_sizes = ctx.needs_input_grad[:4]
+        of_values, of_evidence, of_points = ctx.needs_input_grad[:3]
         amount = slope.to(ctx.like.dtype)
         if ctx.quantum:
             amount = amount.clamp(-LARGEST, LARGEST)
@@ -61,7 +60,7 @@ class Sample(torch.autograd.Function):
         nodes = volume.summed(index, shares, ctx.like) if of_values else None
         sizes = volume.summed(index, shares.abs(), ctx.like) if of_evidence else None
         pull = volume.gradient(points) * slope[:, None] if of_points else None
-        return nodes, sizes, pull, slope.abs() if of_sizes else None, None, None
+        return nodes, sizes, pull, None, None
 
 
 @dataclass(frozen=True)
@@ -78,13 +77,9 @@ class DifferentiableSdf:
         """Make one of node values (voxels) that may require a gradient."""
         return cls(Volume.of(values.detach()), values)
 
-    def sample(self, points: Float[Tensor, "n 3"], sizes: Float[Tensor, " n"] | None = None) -> Float[Tensor, " n"]:
-        """Return the trilinear SDF at points, differentiable with respect to values and points.
-
-        Args:
-            sizes: its gradient receives the absolute value of each sample's gradient.
-        """
-        return Sample.apply(self.values, self.evidence, points, sizes, self.volume, self.quantum)
+    def sample(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        """Return the trilinear SDF at points, differentiable with respect to values and points."""
+        return Sample.apply(self.values, self.evidence, points, self.volume, self.quantum)
 
 
 @dataclass(frozen=True)
@@ -101,7 +96,6 @@ class LightRays:
     lights: Float[Tensor, "n 4"]  # homogeneous
     length: Float[Tensor, " n"]  # to the light, MISSED if it is a direction
     found: Extrema
-    light_sizes: Float[Tensor, " n"] | None = None  # receives the sum of |gradients| that move the light
 
     def sample(self, ray: Int[Tensor, " m"], t: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
         """Return the SDF (voxels) at parameter t of some rays; a point of a ray moves with the ray's ends."""
@@ -110,8 +104,7 @@ class LightRays:
         share = torch.where(is_point, t / length, t)  # of the light's motion that the point shares
         unit = torch.nn.functional.normalize(lights[:, :3], dim=-1)
         step = torch.where(is_point[:, None], lights[:, :3] - origins, unit)
-        sizes = None if self.light_sizes is None else share * self.light_sizes[ray]
-        return self.sdf.sample(origins + share[:, None] * step, sizes)
+        return self.sdf.sample(origins + share[:, None] * step)
 
     def log_transmittance(
         self, sharpness: Float[Tensor, ""] | float, from_surface: bool = False
@@ -140,7 +133,6 @@ def march(
     sharpness: float,
     jitter: Float[Tensor, " n"] | float = 1.0,
     far: Float[Tensor, " n"] | None = None,
-    light_sizes: Float[Tensor, " n"] | None = None,
 ) -> LightRays:
     """March rays from their origins to homogeneous lights, grid frame.
 
@@ -148,12 +140,11 @@ def march(
         sharpness: NeuS s per voxel.
         jitter: see rays.extrema.
         far: length (voxels) at which each ray ends; by default at its light.
-        light_sizes: see LightRays.
     """
     with torch.no_grad():
         directions, length = towards(origins, lights)
         found = extrema(sdf.volume, origins, directions, length if far is None else far, sharpness, jitter)
-    return LightRays(sdf, origins, lights, length, found, light_sizes)
+    return LightRays(sdf, origins, lights, length, found)
 
 
 def transmittance(

@@ -63,16 +63,13 @@ class DenseRays:
     def march(
         self,
         origins: Float[Tensor, "n 3"],
-        lights: Float[Tensor, "n 5"],
+        lights: Float[Tensor, "n 4"],
         sharpness: float,
         jitter: Float[Tensor, " n"],
         far: Float[Tensor, " n"] | None = None,
     ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
         """See RayField."""
-        if lights.requires_grad:
-            lights.register_hook(_rounded)
-        ends = lights.to(self.real)
-        rays = march(self.sdf, origins, ends[:, :4], sharpness, jitter, far, ends[:, 4])
+        rays = march(self.sdf, origins, lights, sharpness, jitter, far)
         found = rays.found
         clear = ((found.count == 0) & (found.best_t > 0) & (found.best_f < BAND)).nonzero()[:, 0]
         least = torch.zeros_like(found.best_f).index_put((clear,), rays.sample(clear, found.best_t[clear]))
@@ -84,11 +81,6 @@ def _in_box(blocks: Tensor, nodes: tuple[int, int, int]) -> Tensor:
     bx, by, bz, _ = blocks.shape
     whole = blocks.view(bx, by, bz, SIDE, SIDE, SIDE).permute(0, 3, 1, 4, 2, 5)
     return whole.reshape(bx * SIDE, by * SIDE, bz * SIDE)[tuple(slice(n) for n in nodes)].contiguous()
-
-
-def _rounded(gradient: Tensor) -> Tensor:
-    """Round a float64 gradient to a multiple of QUANTUM, so that its sums are exact."""
-    return (gradient / QUANTUM).round() * QUANTUM
 
 
 class _Found(NamedTuple):
@@ -125,7 +117,7 @@ class CompiledRays:
     def march(
         self,
         origins: Float[Tensor, "n 3"],
-        lights: Float[Tensor, "n 5"],
+        lights: Float[Tensor, "n 4"],
         sharpness: float,
         jitter: Float[Tensor, " n"],
         far: Float[Tensor, " n"] | None = None,
@@ -157,7 +149,7 @@ class _March(torch.autograd.Function):
         ctx: Any,
         surface: Tensor,
         origins: Float[Tensor, "n 3"],
-        lights: Float[Tensor, "n 5"],
+        lights: Float[Tensor, "n 4"],
         far: Float[Tensor, " n"],
         jitter: Float[Tensor, " n"],
         sharpness: float,
@@ -178,10 +170,10 @@ class _March(torch.autograd.Function):
         field, sharpness, is_clear, marched = ctx.kept
         of_log, of_least = (x.contiguous().numpy() for x in upstream)
         n = len(of_log)
-        back, light = np.empty((n, 3)), np.empty((n, 5))
+        back = np.empty((n, 3))
         slopes = (of_log, np.where(is_clear, of_least, 0.0))
-        run(kernels.scatter_march, n, field.blocks, field.sums, BAND, sharpness, *slopes, *marched, back, light)
-        return None, torch.from_numpy(back), torch.from_numpy(light), None, None, None, None
+        run(kernels.scatter_march, n, field.blocks, field.sums, BAND, sharpness, *slopes, *marched, back)
+        return None, torch.from_numpy(back), None, None, None, None, None
 
 
 @runtime_checkable
@@ -202,17 +194,17 @@ class RayField(Protocol):
     def march(
         self,
         origins: Float[Tensor, "n 3"],
-        lights: Float[Tensor, "n 5"],
+        lights: Float[Tensor, "n 4"],
         sharpness: float,
         jitter: Float[Tensor, " n"],
         far: Float[Tensor, " n"] | None = None,
     ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
         """Return log T of each ray, and the least SDF of those without an extremum, where T = 1 to rounding; else 0.
 
-        Both are differentiable with respect to the nodes, the origins and the lights.
+        Both are differentiable with respect to the nodes and the origins.
 
         Args:
-            lights: homogeneous, and a fifth number, whose gradient gets the size of the gradient that moves the light.
+            lights: homogeneous.
             sharpness: NeuS s per voxel.
             jitter: share of the first step that is taken.
             far: length at which each ray ends; by default at its light.

@@ -16,10 +16,6 @@ from viewer.display.run_follower import loss_curves, residual_text
 from viewer.report import document as doc
 from viewer.report.figures import coverage, curves, lights_from_above
 
-EXPLANATION = (
-    "While the surface is fitted, uncertain lights may move to fit the shadows. The moved lights are kept only if they "
-    "explain shadows that were set aside for a test better than the first ones do."
-)
 MEGABYTE = 1e6
 MOSTLY_USED = 0.75  # of the photos: with fewer, something about the way they were taken is wrong
 RESIDUALS = {  # what calibration may have measured, in words: label, unit, explanation
@@ -180,15 +176,3 @@ def cost_part(stages: Mapping[str, Mapping[str, Any]]) -> str:
         "Time on the clock, time of all processors together, and the most memory held at once.",
         doc.table(("step", "time", "CPU seconds", "memory, MB"), rows, numbers=(1, 2, 3)),
     )
-
-
-def refinement_part(report: Mapping[str, Any]) -> str:
-    """Return the part about refined lights: whether their moves were kept, and how far they went."""
-    trial, rows = report.get("light_trial"), report.get("refined_lights", [])
-    if not trial:
-        return ""
-    told = [str(trial["sentence"]).capitalize() + "."]
-    if trial["accepted"] and rows:
-        middle = np.median([row["sigmas"] for row in rows])
-        told.append(f"Half of the lights moved by less than {middle:.2f} times their ±.")
-    return doc.section("Refined lights", EXPLANATION, doc.bullets(told))

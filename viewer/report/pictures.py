@@ -17,7 +17,7 @@ from calibration.calibration import Calibration
 from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import look
-from reconstruct.render.relight import photographed, shadow_picture, with_refined_lights
+from reconstruct.render.relight import photographed, shadow_picture
 from reconstruct.stored_run.maps import Maps, thumbnail_name
 from viewer.display.run_follower import size_text
 from viewer.report import document as doc
@@ -45,7 +45,7 @@ def computed_picture(fields: SolvedScene, calibration: Calibration, name: str, p
     camera = fields.camera.resized(photo.shape[1], photo.shape[0])
     view = look(fields, posed_camera=replace(fields.posed_camera, camera=camera))
     draw = shadow_picture if is_shadow_picture(photo) else photographed
-    linear, theirs = draw(view, with_refined_lights(calibration, fields), name).numpy(), decode_srgb(photo)
+    linear, theirs = draw(view, calibration, name).numpy(), decode_srgb(photo)
     both = (linear > BRIGHT_ENOUGH) & (theirs > BRIGHT_ENOUGH)
     return encode_srgb((float(np.median(theirs[both] / linear[both])) if both.any() else 1.0) * linear)
 

@@ -26,7 +26,7 @@ from reconstruct.stored_run.stored_run import CALIBRATION, FIELDS, MESH, StoredR
 from viewer.display.run_follower import RunFollower, status
 from viewer.report import document as doc
 from viewer.report.check_page import KINDS
-from viewer.report.numbers import calibration_part, cost_part, curves_part, findings, lights_part, refinement_part
+from viewer.report.numbers import calibration_part, cost_part, curves_part, findings, lights_part
 from viewer.report.pictures import (
     comparison_part,
     guess_facts,
@@ -115,7 +115,6 @@ def report_page(results: Results) -> str:
         photos_part(results.report.get("photos", []), results.calibration, results.thumbs),
         calibration_part(results.calibration),
         lights_part(results.calibration, results.mesh),
-        refinement_part(results.report),
         curves_part(results.log, results.report.get("fit", {})),
         cost_part(results.report.get("stages", {})),
         _origin(results.report),
