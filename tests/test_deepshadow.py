@@ -51,7 +51,7 @@ def test_an_impossible_ground_is_refused_by_name(folder, ground, words):
         ("all_object_lights.txt", "cup_0_0 1 2\n", "line 1"),
         ("all_object_lights.txt", "\n", "lists no light"),
         ("all_object_lights.txt", "saucer_0_0 1 2 3\n", "saucer_0_0_shadow1.png"),
-        ("params.json", "{", "not JSON"),
+        ("params.json", "{", "cannot be read as JSON"),
         ("params.json", '{"focal_length": -1}', "focal_length"),
         ("params.json", '{"focal_length": 44}', "cam_location_x is missing"),
     ],

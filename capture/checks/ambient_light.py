@@ -114,13 +114,21 @@ def excess(shadows: Shadows) -> Float[np.ndarray, " photos"]:
 def _apart(shadows: Shadows) -> dict[int, float]:
     """Photos with more or less light in their shadows than those that are right, and by how much.
 
-    The largest group is right.
+    The largest group is right. A smaller one with less is right instead, if its photos are not darker all over by as
+    much: these were not exposed less, but the others had the room light on.
     """
     more = excess(shadows)
     if np.isfinite(more).sum() < FEWEST_TO_COMPARE:
         return {}
     own = levels(more, ALIKE)
-    right = usual_level(own)
+    right, room = usual_level(own), float(np.nanmedian(shadows.levels))
+    bright = np.log(np.maximum(np.median(shadows.ratios, axis=1), DIM))
+    for lower in np.unique(own[own < right]):
+        less = np.log(max(room + lower, ALIKE) / max(room + right, ALIKE))
+        dimmed = np.median(bright[own == lower]) - np.median(bright[own == right])
+        if abs(dimmed) < abs(dimmed - less) and (own == lower).sum() >= FEWEST_PHOTOS:
+            right = float(lower)
+            break
     return {int(k): float(more[k] - right) for k in np.flatnonzero(np.isfinite(own) & (own != right))}
 
 

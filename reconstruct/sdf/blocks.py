@@ -6,7 +6,7 @@ Blocks have SIDE^3 nodes. Grid frame, voxels. Memory and time grow with the numb
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from scipy import ndimage
 
 from reconstruct.sdf.block_kernels import crossings, overlap
@@ -28,7 +28,7 @@ class Blocks(NamedTuple):
         """Return the block coordinates of the pool's blocks, in order."""
         return np.argwhere(self.layout >= 0).astype(np.int32, order="C")  # one layout: kernels are compiled once
 
-    def dense(self) -> Float[np.ndarray, "nx ny nz"]:
+    def dense(self) -> Shaped[np.ndarray, "nx ny nz"]:
         """Return the values of all nodes, of the pool's type."""
         beyond = np.empty((2, SIDE, SIDE, SIDE), self.pool.dtype)
         beyond[0], beyond[1] = self.far, -self.far
