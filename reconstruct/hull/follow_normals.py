@@ -42,7 +42,7 @@ def follow_normals(
     Returns:
         The grid. Where it was moved, only its sign is right: it is no longer a distance.
     """
-    some = some_pixels(scene, points, own, labels)
+    some = _some_pixels(scene, points, own, labels)
     if some is None:
         return grid
     before, rays, seen = some.before, some.rays, np.isfinite(some.before)
@@ -56,7 +56,7 @@ def follow_normals(
 
 
 @dataclass(frozen=True)
-class SomePixels:
+class _SomePixels:
     """Every step-th pixel along each axis of a picture, and what is known there."""
 
     step: int
@@ -67,9 +67,9 @@ class SomePixels:
     trust: Float[np.ndarray, "height width"]  # in them, 0 to 1
 
 
-def some_pixels(
+def _some_pixels(
     scene: Scene, points: Float[Tensor, "height width 3"], own: Float[Tensor, "height width 3"], labels: Labels
-) -> SomePixels | None:
+) -> _SomePixels | None:
     """Return as many evenly spaced pixels as are integrated at once; None without an object or normals of shading."""
     on_object = (labels.mask > 0.5) & (own != 0).any(-1)
     step = 1 + int((float(on_object.sum()) / MOST_PIXELS) ** 0.5)
@@ -80,7 +80,7 @@ def some_pixels(
     t = (points - scene.eye).norm(dim=-1)[part].numpy().astype(np.float64)
     read = (labels.normals, labels.normal_confidence)
     normals, trust = (image[part].numpy().astype(np.float64) for image in read)
-    return SomePixels(
+    return _SomePixels(
         step, scene.directions[part].numpy(), np.where(seen, t, np.nan), own[part].numpy(), normals, trust
     )
 

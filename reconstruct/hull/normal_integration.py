@@ -17,8 +17,7 @@ from reconstruct.labels.photometric_stereo import NORMAL_SIGMA
 
 ROUNDS = 6  # of reweighting
 BREAK = 2.0  # pixels between the tangent planes of neighbours that are on different surfaces, before and after
-GUESSED = 2 * BREAK  # pixels of empty space before a depth that is a guess: its breaks are guesses, too
-GUESSED_WIDTHS = (np.inf, *np.geomspace(30.0, 1.4, 9))  # of BREAK, for pairs with such a depth, in rounds before others
+WIDE_FIRST = (np.inf, *np.geomspace(30.0, 1.4, 9))  # of BREAK, in rounds before the last, where breaks are unknown
 TOUCHING = 10.0  # times heavier when in front of a bound, where nothing can be, than behind it
 OUTSIDE = 1000.0  # of the usual tie, in front of a hull that shadows carved
 # Per squared pixel: a side that touches its hull leaves it by half a pixel if all its normals err by their sigma.
@@ -44,7 +43,6 @@ def integrate_normals(
     normals: Float[np.ndarray, "height width 3"],
     trust: Float[np.ndarray, "height width"],
     bounds: bool = False,
-    front: Float[np.ndarray, "height width"] | None = None,
 ) -> Float[np.ndarray, "height width"]:
     """Solve for ray lengths t from the eye, so that the surface t * ray has the given normals and stays near `before`.
 
@@ -57,24 +55,16 @@ def integrate_normals(
         own: its normals, which are used where the given ones are not trusted.
         bounds: nothing is in front of the present surface: the tie is stronger in front than behind. Otherwise it is
             stronger at the outline, which shadow edges determine.
-        front: t before which nothing can be, where that is not the present surface. A depth GUESSED pixels or more
-            behind it is a guess, and breaks beside it are found anew: pairs begin without robust weights, which then
-            narrow [graduated non-convexity: Blake and Zisserman, Visual Reconstruction, 1987].
     """
     where = np.isfinite(before)
     t0 = before[where]
     chords = _chords(rays, before, own, normals, trust)
-    first = t0 if front is None else np.minimum(front[where], t0)
-    guess = (t0 - first) / chords.size > GUESSED
-    guessed = guess[chords.first] | guess[chords.second]
-    broken = np.abs(chords.apart) > BREAK
-    apart = np.where(broken & guessed, 0, chords.apart)
-    weight = np.where(broken & ~guessed, 0, chords.weight)
+    weight = np.where(np.abs(chords.apart) > BREAK, 0, chords.weight)
     tie = _tie(where, 0 if bounds else OUTLINE)[where] / chords.size**2
     t = t0
-    for wider in (*(GUESSED_WIDTHS if guess.any() else ()), *(1.0 for _ in range(ROUNDS))):
-        hold = tie * np.where(t < first, TOUCHING if bounds else 1.0, 1.0)
-        t = _reweighted(chords.slope, apart, weight, BREAK * np.where(guessed, wider, 1.0), hold, t0, t)
+    for _ in range(ROUNDS):
+        hold = tie * np.where(t < t0, TOUCHING if bounds else 1.0, 1.0)
+        t = _reweighted(chords.slope, chords.apart, weight, BREAK, hold, t0, t)
     return _spread(t, where)
 
 
@@ -92,7 +82,8 @@ def integrate_within(
     Two surfaces that touch have one normal there. So the hull is the surface, to a pixel, where shading tells the
     hull's own normal; elsewhere it lies in front of the surface by no one knows what: over a bowl it is a lid. Held to
     the lid as to an outline, the bottom of a bowl came half way up. Since breaks of the hull are not the surface's, as
-    at the bowl's front rim, pairs begin without robust weights, which then narrow, as in `integrate_normals`.
+    at the bowl's front rim, pairs begin without robust weights, which then narrow [graduated non-convexity: Blake and
+    Zisserman, Visual Reconstruction, 1987].
 
     Args:
         hull: t of the hull; nan where there is none.
@@ -108,7 +99,7 @@ def integrate_within(
     touching = TOUCH * np.maximum(likeness(own, normals, trust)[where], DUST) / chords.size**2
     held = np.zeros(len(t0), bool) if matter is None else matter[where] > LIKELY
     t = t0 if behind is None else np.where(held | np.isnan(behind[where]), t0, behind[where])
-    for wider in (*(GUESSED_WIDTHS if behind is None else ()), *(1.0 for _ in range(ROUNDS))):
+    for wider in (*(WIDE_FIRST if behind is None else ()), *(1.0 for _ in range(ROUNDS))):
         width = wider * BREAK
         near = touching * geman_mcclure(((t - t0) / (width * chords.size)) ** 2) + DUST * outside
         hold = np.where(t < t0, outside, near)

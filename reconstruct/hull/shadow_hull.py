@@ -98,10 +98,9 @@ def ground_maps(scene: Scene, labels: Labels, region: np.ndarray, relief: Relief
 
 @dataclass(frozen=True)
 class Hull:
-    """The shadow hull, and the space that nothing proves empty, which contains it; of both only the sign is valid."""
+    """The shadow hull, of which only the sign is valid."""
 
     grid: SdfGrid
-    space: SdfGrid
     maps: GroundMaps  # that carved it
 
 
@@ -142,7 +141,7 @@ def carve_grid(
     for scene, labels in views:
         _carve_from_the_side(values, scene.side_views, lower, spacing)
         _carve_beside_picture(values, scene, labels, lower, spacing)
-    inside, space = values < 0, values.copy()
+    inside = values < 0
     of_a_view = (len(maps.lights) - len(views)) // len(views)  # one view sees ground in a node's shadow, at least
     above = lower[2] + spacing * np.arange(shape[2]) - views[0][0].ground_height
     rays = [pixel_rays(scene, labels, lower, spacing, inside.shape) for scene, labels in views]
@@ -153,8 +152,7 @@ def carve_grid(
         keep = with_seen_pixels(keep, inside, needed, own)
     kept = without_specks(inside & with_support(keep))
     values[inside & ~without_floating(kept, above < STANDING * spacing, rays)] = 0.5 * spacing
-    grids = [SdfGrid(torch.from_numpy(x), torch.from_numpy(lower).float(), spacing) for x in (values, space)]
-    return Hull(*grids, maps)
+    return Hull(SdfGrid(torch.from_numpy(values), torch.from_numpy(lower).float(), spacing), maps)
 
 
 def _carve_from_the_side(values: np.ndarray, views: Sequence[SideView], lower: np.ndarray, spacing: float) -> None:

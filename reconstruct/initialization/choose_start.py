@@ -161,7 +161,7 @@ class HullStart:
         scene, observer = views[0]
         if scene.ground_depth is None and not is_shared(scene):
             self._doubts = _doubts(scene, ground_labels[0], found.maps)  # these maps are made once
-        bent = BentHull(scene, observer, self.config, self._say).found(hull, resampled(found.space, nodes).grid())
+        bent = BentHull(scene, observer, self.config, self._say).found(hull)
         if scene.rgb is None and bent is not hull:
             self.name = LIT_HULL
         return bent
