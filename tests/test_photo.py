@@ -1,5 +1,6 @@
 import contextlib
 import io
+import json
 import struct
 from pathlib import Path
 
@@ -281,14 +282,30 @@ def test_a_stack_on_disk_is_that_in_memory_bit_for_bit_and_is_not_read_twice(pat
         stack.rgb[:] = 0  # what a reader does to its copy does not reach the files
 
 
-@pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"[]", b'{"format": 1}', b"[" * 9999])
-def test_a_list_that_is_none_and_files_cut_short_start_anew(paths, tmp_path, monkeypatch, content):
-    kept, plain = tmp_path / "kept", read_stack(paths, 8)
-    for name in (LIST, COLOURS, CLIPPED):
-        read_stack(paths, 8, kept=kept)
-        (kept / name).write_bytes(content)
-        stack, opened = read_again(paths, kept, monkeypatch)
-        assert len(opened) == len(paths) and np.array_equal(stack.rgb, plain.rgb)
+def test_photos_that_were_not_finished_or_are_damaged_are_read_again_and_only_these(paths, tmp_path, monkeypatch):
+    kept = tmp_path / "kept"
+    plain, _ = read_again(paths, kept, monkeypatch)
+    lines = (kept / LIST).read_text().splitlines()
+    order = [json.loads(line)["index"] for line in lines[1:]]
+    (kept / LIST).write_text("\n".join(lines[:-1]) + "\n" + lines[-1][:20])  # killed while the last line was written
+    with (kept / COLOURS).open("r+b") as file:
+        file.seek(order[0] * 12 * 48)
+        file.write(b"\xff")
+    with (kept / CLIPPED).open("r+b") as file:
+        file.seek(order[1] * 48)
+        file.write(b"\x07")
+    stack, opened = read_again(paths, kept, monkeypatch)
+    assert opened == sorted(paths[i].name for i in (order[0], order[1], order[-1]))
+    assert np.array_equal(stack.rgb, plain.rgb) and np.array_equal(stack.clipped, plain.clipped)
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"[]\n[]\n", b'{"format": 1}\n{"index": 7}\n', b"[" * 9999])
+def test_a_list_that_is_none_starts_anew(paths, tmp_path, monkeypatch, content):
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    (kept / LIST).write_bytes(content)
+    stack, opened = read_again(paths, kept, monkeypatch)
+    assert len(opened) == len(paths) and np.array_equal(stack.rgb, read_stack(paths, 8).rgb)
 
 
 def test_photos_of_another_size_are_refused_by_name_in_memory_and_on_disk(paths, tmp_path):

@@ -326,8 +326,13 @@ def _as_floats(stored: Shaped[np.ndarray, "height width channels"]) -> Float[np.
     height, width = stored.shape[:2]
     step = reduction(width, height)
     full = np.float32(np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1)
-    grey = mean_of_channels(stored[: height // step * step, : width // step * step].astype(np.float32)) / full
-    return grey if step == 1 else np.asarray(cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+    grey = np.empty((height // step, width // step), np.float32)
+    for top in range(0, len(grey), STRIP_ROWS):
+        strip = grey[top : top + STRIP_ROWS]
+        values = stored[step * top : step * (top + len(strip)), : step * strip.shape[1]].astype(np.float32) / full
+        mean = mean_of_channels(values)
+        strip[:] = mean if step == 1 else cv2.resize(mean, strip.shape[::-1], interpolation=cv2.INTER_AREA)
+    return grey
 
 
 def write_picture(path: Path, linear_rgb: Float[np.ndarray, "height width 3"]) -> None:
