@@ -168,6 +168,6 @@ def test_the_start_is_judged_by_its_labels_that_were_read_and_by_no_others():
     assert start.better(first, other, (scene,)) is first
     assert read == [first, other]
     start.labels(other, (scene,))
-    moved = replace(scene, lights=scene.lights + torch.tensor([9.0, 0, 0, 0]))
+    moved = replace(scene, ground_height=scene.ground_height + 1.0)
     start.better(other, first, (moved,))
     assert read == [first, other, other, other]
