@@ -11,6 +11,7 @@ FUNCTION_LINES = 60
 MODULE_LINES = 400
 FILE_BYTES = 500_000
 PRODUCT = ("capture", "calibration", "reconstruct", "viewer", "shadowgraph")
+LONG_MODULES = {"kernels.py": "numba inlines functions of one module only, and compiles them together"}
 
 
 def long_functions(tree: ast.AST) -> list[tuple[ast.FunctionDef | ast.AsyncFunctionDef, int]]:
@@ -35,7 +36,7 @@ def faults(path: Path) -> list[str]:
         ]
         lines = content.count(b"\n")
         is_product = any(parent.name in PRODUCT for parent in path.parents)
-        if is_product and lines > MODULE_LINES:
+        if is_product and path.name not in LONG_MODULES and lines > MODULE_LINES:
             found.append(f"{path}: {lines} lines, at most {MODULE_LINES}")
     return found
 

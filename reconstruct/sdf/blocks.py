@@ -58,9 +58,15 @@ def pack(values: Float[np.ndarray, "nx ny nz"]) -> Blocks:
 
 
 def index_of(stored: Bool[np.ndarray, "bx by bz"], inside: Bool[np.ndarray, "bx by bz"]) -> Int[np.ndarray, "bx by bz"]:
-    """Number the stored blocks from 0; of the others, those inside get -1 and those outside -2."""
+    """Number the stored blocks from 0; others get -(2 d + inside), with d the Chebyshev distance to a stored block."""
+    if stored.all():
+        away = np.zeros(stored.shape, np.int32)
+    elif stored.any():
+        away = np.asarray(ndimage.distance_transform_cdt(~stored, "chessboard"), np.int32)
+    else:
+        away = np.full(stored.shape, max(stored.shape), np.int32)
     number = np.cumsum(stored, dtype=np.int32).reshape(stored.shape) - 1
-    return np.where(stored, number, np.where(inside, -1, -2)).astype(np.int32)
+    return np.where(stored, number, -(2 * away + inside)).astype(np.int32)
 
 
 def near_surface(field: Blocks, far: float) -> Blocks:

@@ -11,7 +11,7 @@ not.
 
 The argument `phi` is always the tuple of reconstruct/sdf/blocks.py, with overlapping blocks: an index of blocks of
 SIDE^3 cells, a pool with the nodes of blocks near the surface, the grid's numbers of nodes, and |SDF| in blocks that
-are not stored. Gradients do not overlap: SIDE^3 nodes per block are used.
+are not stored. Rays skip those. Gradients do not overlap: SIDE^3 nodes per block are used.
 
 UNCOUNTED functions do without numba's counts of references to arrays, at which cores wait for each other. They cannot
 make arrays, nor call methods of arrays that do, as max(). INNER functions are called by other kernels alone: no entry
@@ -59,18 +59,33 @@ def _cell(nodes, x, y, z):
 
 
 @njit(forceinline=True, **INNER)
+def _beyond(block, far):
+    """Return the SDF in a block that is not stored: odd numbers are inside."""
+    return -far if block & 1 else far
+
+
+@njit(forceinline=True, **INNER)
 def _sample(phi, x, y, z):
     index, pool, nodes, far = phi
     i, j, k, u, v, w = _cell(nodes, x, y, z)
     block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
     if block < 0:
-        return -far if block & 1 else far
+        return _beyond(block, far)
     p, q, r = i & WITHIN, j & WITHIN, k & WITHIN
     a = pool[block, p, q, r] * (1 - w) + pool[block, p, q, r + 1] * w
     b = pool[block, p, q + 1, r] * (1 - w) + pool[block, p, q + 1, r + 1] * w
     c = pool[block, p + 1, q, r] * (1 - w) + pool[block, p + 1, q, r + 1] * w
     d = pool[block, p + 1, q + 1, r] * (1 - w) + pool[block, p + 1, q + 1, r + 1] * w
     return (a * (1 - v) + b * v) * (1 - u) + (c * (1 - v) + d * v) * u
+
+
+@njit(forceinline=True, **INNER)
+def _free(phi, x, y, z):
+    """Return the distance that a point can move in any direction without reaching a stored block; 0 in one."""
+    index, _, nodes, _ = phi
+    i, j, k, _, _, _ = _cell(nodes, x, y, z)
+    block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
+    return SIDE * ((-block >> 1) - 1.0) if block < 0 else 0.0
 
 
 @njit(forceinline=True, **INNER)
@@ -191,6 +206,10 @@ def _extrema(phi, ox, oy, oz, dx, dy, dz, near, far, s, jitter, lows, highs):
         if first:
             step *= jitter
             first = False
+        elif size >= phi[3]:  # the SDF is constant there: the same steps, without sampling it
+            leap = min(tb + _free(phi, ox + tb * dx, oy + tb * dy, oz + tb * dz), far)
+            while tb + step < leap:
+                tb += step
         tc = min(tb + step, far)
         fc = _sample(phi, ox + tc * dx, oy + tc * dy, oz + tc * dz)
         if fc < fb:
@@ -250,6 +269,11 @@ def _first_surface(phi, ox, oy, oz, dx, dy, dz, near, far, width):
             return cross, part_t, part_f
         if tb >= far:
             break
+        if fb >= phi[3]:  # the SDF is constant there: the same steps, without sampling it
+            leap = min(tb + _free(phi, ox + tb * dx, oy + tb * dy, oz + tb * dz), far)
+            while tb + _stride(fb, 0.5 * width * tb) < leap:
+                tb += _stride(fb, 0.5 * width * tb)
+            half = 0.5 * width * tb
         tc = min(tb + _stride(fb, half), far)
         fc = _sample(phi, ox + tc * dx, oy + tc * dy, oz + tc * dz)
         if fb >= 0 and fc < 0:
