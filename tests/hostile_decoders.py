@@ -123,6 +123,15 @@ def nests(file: BinaryIO) -> Iterator[Answer]:
 
 def _says(words: bytes, file: BinaryIO) -> Iterator[Answer]:
     """Answers past the module that would."""
-    socket.socket(fileno=os.dup(0)).send(words + b"\n")
+    socket.socket(fileno=os.dup(0)).send(words)
     signal.pause()
     yield Answer()
+
+
+def keeps_its_answer(file: BinaryIO) -> Iterator[Answer]:
+    """Says that its array is there, and goes on writing to it."""
+    import mmap
+
+    newest = file.fileno() - 1  # the memory for the answer was handed over with the file
+    _held.append(mmap.mmap(newest, GRANTED))
+    yield from _says(b'{"numbers": [], "names": [], "shape": [8], "samples": "uint8"}', file)

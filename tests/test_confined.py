@@ -142,6 +142,7 @@ def test_a_decoder_that_breaks_off_is_said_with_its_file(photo, tmp_path):
         hostile.gives_numbers_that_are_none,
         hostile.talks_nonsense,
         hostile.nests,
+        hostile.keeps_its_answer,
     ],
 )
 def test_an_answer_that_is_none_is_refused(task, photo, tmp_path, monkeypatch):

@@ -51,7 +51,7 @@ def exr_header(path: Path) -> ExrHeader:
 
 
 def read_exr(path: Path) -> dict[str, Float[np.ndarray, "height width"]]:
-    """Return the channels of the first part, by name, float32.
+    """Return the channels of the first part, by name, float32, read-only.
 
     Raises:
         CaptureError: no readable OpenEXR file, or larger than PIXEL_CAP.

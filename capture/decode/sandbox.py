@@ -1,8 +1,8 @@
 """Run decoders of untrusted files in a separate process that has no other rights.
 
 `decoding` runs a task, a generator of Answers, in another process (capture/decode/sandbox_process.py). The process gets
-the open file, and answers in a line of JSON and the bytes of one array. Its first answer is the file's header; if that
-is acceptable, bytes are granted for the pixels. Numbers, short names, and the array's kind and size are all checked;
+the open file, and for each answer shared memory of a size chosen here. Its first answer is the file's header; if that
+is acceptable, it gets memory for the pixels. It returns numbers, short names and one array, which are all checked;
 nothing is unpickled. A task that takes more memory or time than its picture justifies is ended, and the error names the
 file. Processes are kept for the next file. On systems other than Linux tasks run in this process, see `confinement`.
 """
@@ -10,6 +10,7 @@ file. Processes are kept for the next file. On systems other than Linux tasks ru
 import atexit
 import json
 import math
+import mmap
 import os
 import re
 import signal
@@ -38,7 +39,7 @@ OWN_PLACE = str(Path(__file__).resolve().parents[2])  # where this package is im
 BLOCK = 1 << 20  # bytes that are copied at a time
 
 
-IS_CONFINED = sys.platform == "linux"  # limits and memory files are Linux's
+IS_CONFINED = sys.platform == "linux"  # limits, memory files and their seals are Linux's
 FIXED_ROOM = 512 << 20  # bytes that a decoder may use for its tables, for any picture
 ROOM_PER_CORE = 16 << 20  # decoders start a thread per core, each with its stack
 ROOM_PER_PIXEL = 48  # bytes: a RAW file takes 22, an OpenEXR file of eight channels 45
@@ -144,7 +145,7 @@ class _Decoder:
     """A process that decodes files, and the connection to it."""
 
     def __init__(self) -> None:
-        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         paths = os.pathsep.join([*(os.path.abspath(entry) for entry in sys.path if entry), OWN_PLACE])
         single = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
         words = [sys.executable, "-P", "-m", "capture.decode.sandbox_process", *MODULES]
@@ -162,8 +163,7 @@ class _Decoder:
         self._handed: list[int] = []  # file descriptors that go with it
         self._is_in_step = True  # its last answer was valid
         self.is_waiting = True  # for the next file
-        self._answers = self._socket.makefile("rb")
-        if not self._answers.readline(LARGEST_MESSAGE):
+        if not self._socket.recv(LARGEST_MESSAGE):
             self.stop()
             raise RuntimeError(f"the process that decodes pictures did not start: {' '.join(words)}")
 
@@ -184,11 +184,12 @@ class _Decoder:
         cores = os.cpu_count() or 1
         room = FIXED_ROOM + ROOM_PER_CORE * cores + ROOM_PER_PIXEL * pixels
         seconds += SECONDS + SECONDS_PER_MEGAPIXEL * pixels / 1e6
+        memory = sealed(most_bytes)
         try:
             request = {**self._fresh, "room": room, "seconds": math.ceil(seconds)}
             request["clock"] = math.ceil(PATIENCE * seconds) + 1
-            reply = self._exchange(request, self._handed, seconds, room)
-            answer = self._checked(reply, most_bytes) if "numbers" in reply else None
+            reply = self._exchange(request, [memory, *self._handed], seconds, room)
+            answer = _checked(reply, memory, most_bytes) if "numbers" in reply else None
             self.is_waiting = answer is None and reply.get("fault") != "memory"
             self._is_in_step = answer is not None
         except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
@@ -196,6 +197,7 @@ class _Decoder:
         finally:
             self._fresh = {}
             self._drop_handed()
+            os.close(memory)
         if "fault" in reply:
             said = COPY_IN_MEMORY.sub(self._path.name, str(reply.get("text")))
             raise broken(self._path, said) if self.is_waiting else self._too_much(room)
@@ -214,7 +216,6 @@ class _Decoder:
     def stop(self) -> None:
         """Kill the process."""
         self._drop_handed()
-        self._answers.close()
         self._socket.close()
         self._process.kill()
         self._process.wait()
@@ -229,7 +230,7 @@ class _Decoder:
         self._is_in_step = False
         try:
             socket.send_fds(self._socket, [json.dumps(request).encode()], files)
-            reply = self._answers.readline(LARGEST_MESSAGE)
+            reply = self._socket.recv(LARGEST_MESSAGE)
         except TimeoutError as error:
             raise self._too_long(PATIENCE * seconds) from error
         except OSError:
@@ -245,29 +246,6 @@ class _Decoder:
         how = signal.Signals(-code).name if code < 0 else f"code {code}"
         raise broken(self._path, f"its decoder broke off, {how}")
 
-    def _checked(self, reply: dict[str, Any], most_bytes: int) -> Answer:
-        """Check a reply, and return it as an Answer with the array that follows.
-
-        Raises:
-            ValueError, TypeError, KeyError: the reply is invalid, or the array ends early.
-        """
-        numbers = tuple(float(value) for value in reply["numbers"][:MOST_NUMBERS])
-        names = tuple(name[:LONGEST_NAME] for name in reply["names"][:MOST_NAMES] if isinstance(name, str))
-        if not all(math.isfinite(value) for value in numbers):
-            raise ValueError("numbers that are none")
-        shape, kind = reply["shape"], reply["samples"]
-        if shape is None:
-            return Answer(numbers, names)
-        if kind not in SAMPLES or not 1 <= len(shape) <= 3 or not all(type(n) is int and n >= 0 for n in shape):
-            raise ValueError(f"an array of {kind} of shape {shape}"[:100])
-        size = math.prod(shape) * np.dtype(kind).itemsize
-        if size > most_bytes:
-            raise ValueError(f"{size} bytes where {most_bytes} were granted")
-        pixels = np.zeros(shape, kind)
-        if self._answers.readinto(pixels.reshape(-1).view(np.uint8)) != size:
-            raise ValueError("its array ends early")
-        return Answer(numbers, names, pixels)
-
     def _too_long(self, seconds: float) -> CaptureError:
         return CaptureError(
             f"{self._path} could not be decoded within {seconds:.0f} s, more than a picture of its size takes. "
@@ -279,6 +257,27 @@ class _Decoder:
             f"{self._path} could not be decoded within {room / 1e9:.1f} GB of memory, more than a picture of its size "
             "takes. Copy it again from the phone, or remove it; where memory is short, close other programs."
         )
+
+
+def _checked(reply: dict[str, Any], memory: int, most_bytes: int) -> Answer:
+    """Check a reply and return it as an Answer.
+
+    Raises:
+        ValueError, TypeError, KeyError: the reply is invalid, or its process can still change its array.
+    """
+    numbers = tuple(float(value) for value in reply["numbers"][:MOST_NUMBERS])
+    names = tuple(name[:LONGEST_NAME] for name in reply["names"][:MOST_NAMES] if isinstance(name, str))
+    if not all(math.isfinite(value) for value in numbers):
+        raise ValueError("numbers that are none")
+    shape, kind = reply["shape"], reply["samples"]
+    if shape is None:
+        return Answer(numbers, names)
+    if kind not in SAMPLES or not 1 <= len(shape) <= 3 or not all(type(n) is int and n >= 0 for n in shape):
+        raise ValueError(f"an array of {kind} of shape {shape}"[:100])
+    size = math.prod(shape) * np.dtype(kind).itemsize
+    if size > most_bytes:
+        raise ValueError(f"{size} bytes where {most_bytes} were granted")
+    return Answer(numbers, names, mapped(memory, size, kind).reshape(shape))
 
 
 _idle: list[_Decoder] = []
@@ -310,6 +309,22 @@ if IS_CONFINED:
     os.register_at_fork(after_in_child=_idle.clear)  # the processes are the parent's
 
 
+if sys.platform == "linux":
+    import fcntl
+
+
+def sealed(size: int) -> int:
+    """Open a memory file of a fixed size: if it could be shortened, that would crash its reader.
+
+    Raises:
+        OSError: there is not enough memory, or the size is invalid.
+    """
+    number = os.memfd_create(NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    os.ftruncate(number, size)
+    fcntl.fcntl(number, fcntl.F_ADD_SEALS, fcntl.F_SEAL_GROW | fcntl.F_SEAL_SHRINK)
+    return number
+
+
 def copied(file: BinaryIO) -> int:
     """Open a copy of a file in memory."""
     number = os.memfd_create(NAME, os.MFD_CLOEXEC)
@@ -317,3 +332,18 @@ def copied(file: BinaryIO) -> int:
         while block := file.read(BLOCK):
             copy.write(block)
     return number
+
+
+def mapped(number: int, size: int, kind: str) -> Shaped[np.ndarray, " samples"]:
+    """Map a sealed file as a read-only array, without a copy; the memory is freed with the array.
+
+    Raises:
+        ValueError: a process can still write to it.
+    """
+    if not size:
+        return np.zeros(0, kind)
+    try:
+        fcntl.fcntl(number, fcntl.F_ADD_SEALS, fcntl.F_SEAL_WRITE)
+    except OSError as error:
+        raise ValueError("its array is still being written to") from error
+    return np.frombuffer(mmap.mmap(number, size, mmap.MAP_PRIVATE | mmap.MAP_POPULATE, mmap.PROT_READ), kind)

@@ -1,11 +1,12 @@
 """The process that decodes untrusted files: it gives up all rights that it does not need, then answers the sandbox.
 
 It is started as `python -m capture.decode.sandbox_process MODULE...` with a socket as standard input. A request is JSON
-with, for the first answer, the file to decode; an answer is a line of JSON and the bytes of its array.
+with a memory file for the answer's array and, for the first answer, the file to decode.
 """
 
 import json
 import math
+import mmap
 import multiprocessing
 import os
 import resource
@@ -22,7 +23,8 @@ from PIL import TiffImagePlugin
 from capture.decode.landlock import restrict_self
 from capture.decode.sandbox import DAMAGED, LARGEST_MESSAGE, Answer, Task
 
-FILES_AT_WORK = 3  # file, and two to open a file in memory by its name
+FILES_AT_WORK = 4  # file, memory for the answer, and two to open a file in memory by its name
+HANDED = 2  # files that come with a request
 LONGEST_TEXT = 500  # letters of an error
 AT_FIRST_USE = (multiprocessing, TiffImagePlugin)  # imported late by rawpy and Pillow, when no file can be opened
 
@@ -47,32 +49,26 @@ def serve(connection: socket.socket) -> None:
     statm = os.open("/proc/self/statm", os.O_RDONLY)
     answers: Iterator[Answer] = iter(())
     restrict_process()
-    _say(connection, {"end": True}, None)  # ready
+    connection.send(json.dumps({"end": True}).encode())  # ready
     while True:
-        request, files, _, _ = socket.recv_fds(connection, LARGEST_MESSAGE, 1)
+        request, files, _, _ = socket.recv_fds(connection, LARGEST_MESSAGE, HANDED)
         if not request:
             return
         words = json.loads(request)
         reply: dict[str, Any] = {"end": True}
-        pixels = None
         if "stop" in words:
             answers = iter(())
         else:
             _limit(words["room"], words["seconds"], statm)
             if "task" in words:
-                answers = _begun(words["task"], files[0], words["arguments"])
+                answers = _begun(words["task"], files[1], words["arguments"])
             signal.alarm(words["clock"])  # ends this process if the other side is gone and cannot do so
-            reply, pixels = _reply(answers)
+            reply = _reply(answers, files[0])
             signal.alarm(0)
+            os.close(files[0])
         if "shape" not in reply:
             answers = iter(())  # and its file is closed
-        _say(connection, reply, pixels)
-
-
-def _say(connection: socket.socket, reply: dict[str, Any], pixels: np.ndarray | None) -> None:
-    connection.sendall(json.dumps(reply).encode() + b"\n")
-    if pixels is not None:
-        connection.sendall(np.ascontiguousarray(pixels).reshape(-1))
+        connection.send(json.dumps(reply).encode())
 
 
 def _begun(name: str, number: int, arguments: list[float]) -> Iterator[Answer]:
@@ -94,18 +90,31 @@ def _limit(room: int, seconds: int, statm: int) -> None:
         resource.setrlimit(limit, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
 
 
-def _reply(answers: Iterator[Answer]) -> tuple[dict[str, Any], np.ndarray | None]:
+def _reply(answers: Iterator[Answer], memory: int) -> dict[str, Any]:
     try:
         answer = next(answers, None)
+        if answer is None:
+            return {"end": True}
+        _put(answer.pixels, memory)
     except MemoryError:
-        return {"fault": "memory"}, None
+        return {"fault": "memory"}
     except DAMAGED as error:
-        return {"fault": "damaged", "text": str(error)[:LONGEST_TEXT]}, None
-    if answer is None:
-        return {"end": True}, None
+        return {"fault": "damaged", "text": str(error)[:LONGEST_TEXT]}
     shape, samples = (None, "") if answer.pixels is None else (answer.pixels.shape, answer.pixels.dtype.name)
-    words = {"numbers": answer.numbers, "names": answer.names, "shape": shape, "samples": samples}
-    return words, answer.pixels
+    return {"numbers": answer.numbers, "names": answer.names, "shape": shape, "samples": samples}
+
+
+def _put(pixels: np.ndarray | None, memory: int) -> None:
+    """Copy pixels to the memory file and unmap it: the other side accepts it only when nobody can change it."""
+    if pixels is None or not pixels.nbytes:
+        return
+    size = os.fstat(memory).st_size
+    if pixels.nbytes > size:
+        raise ValueError(f"{pixels.nbytes} bytes of pixels, {size} were expected by the header")
+    with mmap.mmap(memory, size) as mapped:
+        there = np.frombuffer(mapped, pixels.dtype, pixels.size).reshape(pixels.shape)
+        np.copyto(there, pixels)
+        del there
 
 
 if __name__ == "__main__":

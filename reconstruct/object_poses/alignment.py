@@ -354,6 +354,7 @@ def mean_difference(
     Args:
         a, b: errors of the same rays or points in two cases; nan where unknown.
         group: of each error, counted from 0.
+        weight: of each error in the mean.
     """
     known = np.isfinite(a) & np.isfinite(b)
     counts = np.broadcast_to(weight, known.shape)[known]
