@@ -97,10 +97,10 @@ class Observer:
         A first look under an endless ground, or none, gives the albedo with which light between surfaces is found.
         """
         assert self._ground is not None
-        on_object = label_object(scene, points, normals, self._ground.mask, self._ground, first_look=True)
+        on_object = label_object(scene, points, normals, self._ground.mask, self._ground)
         albedo = self._beside_ground(on_object.albedo, normals)
         indirect = self._between_surfaces(self._solved(surface, scene, albedo, None), scene)[1]
-        if indirect is not None or on_object.is_alone:
+        if indirect is not None:
             on_object = label_object(scene, points, normals, self._ground.mask, self._ground, indirect)
         matt = self._matt(scene, points, on_object, indirect)
         if matt is None:
