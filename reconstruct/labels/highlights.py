@@ -31,38 +31,10 @@ from reconstruct.sdf.rays import shadow_starts, unshadowed
 from reconstruct.shading.noise import DEFAULT_NOISE
 
 SURE_NORMAL = 0.5  # confidence: of the pixels that the lobes are learnt from
-SURE_LABEL = 0.2  # confidence of a shadow label
 SURELY_LIT = 0.9  # of the light arrives: penumbras and shadow edges are left out
 PIXELS_AT_ONCE, USUAL_PHOTOS = 16384, 40  # stay below 60 MB; of more photos, fewer pixels
 JOINT_PIXELS = 1500  # that lobes, powers and normals are fitted to together
 FEWEST_LIT = 3  # photos behind an albedo: with fewer, the albedo of the nearest known pixel is used
-
-
-def without_highlights(
-    scene: Scene, points: Float[Tensor, "height width 3"], labels: ObjectLabels, indirect: Indirect
-) -> Scene | None:
-    """Remove the object's highlights from the photos, so that Lambert's law holds; None if the object is matt.
-
-    The highlights come from lobes fitted with the photometric normals of a first pass; a second pass improves them.
-
-    Args:
-        points: world, the current surface.
-        labels: from the unmodified photos.
-    """
-    assert scene.rgb is not None
-    row, column = torch.nonzero(labels.normal_confidence > SURE_NORMAL).unbind(1)
-    step = max(1, len(row) // ENOUGH_PIXELS)
-    sure = row[::step], column[::step]
-    lit = (labels.visibility[:, sure[0], sure[1]] > 0.5) & (labels.confidence[:, sure[0], sure[1]] > SURE_LABEL)
-    lobes = fit_lobes(gather(scene, points[sure], labels.normals[sure], sure, lit.float(), indirect))
-    if not lobes.coefficients.any():
-        return None
-    rgb = scene.rgb.clone()
-    for pixels in _blocks((labels.normals != 0).any(-1), len(rgb)):
-        lit = torch.ones(len(rgb), len(pixels[0]))  # where it is not, the photo stays dark
-        part = gather(scene, points[pixels], labels.normals[pixels], pixels, lit, indirect)
-        rgb[:, pixels[0], pixels[1]] -= highlights(part, lobes.coefficients).transpose(0, 1)
-    return replace(scene, rgb=rgb.clamp_(min=0))
 
 
 def material_without_ground(

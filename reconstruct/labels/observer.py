@@ -21,7 +21,6 @@ from reconstruct.labels.highlights import (
     surface_appearance,
     with_lit_ground,
     with_powers,
-    without_highlights,
 )
 from reconstruct.labels.labels import Labels, assemble_labels
 from reconstruct.labels.lit_labels import with_lit_normals
@@ -92,7 +91,7 @@ class Observer:
         points: Float[Tensor, "height width 3"],
         normals: Float[Tensor, "height width 3"],
     ) -> ObjectLabels:
-        """Label the object's pixels from shading, with highlights removed if it is glossy.
+        """Label the object's pixels from shading; without a ground, with highlights removed and powers fitted.
 
         A first look under an endless ground, or none, gives the albedo with which light between surfaces is found.
         """
@@ -102,25 +101,13 @@ class Observer:
         indirect = self._between_surfaces(self._solved(surface, scene, albedo, None), scene)[1]
         if indirect is not None:
             on_object = label_object(scene, points, normals, self._ground.mask, self._ground, indirect)
-        matt = self._matt(scene, points, on_object, indirect)
-        if matt is None:
+        material = None if scene.ground_known else material_without_ground(scene, points, on_object)
+        if material is None:
             return on_object
+        matt = matt_photos(scene, points, on_object, material)
         again = label_object(matt, points, normals, self._ground.mask, self._ground, indirect)
         lit = torch.maximum(on_object.visibility, again.visibility)  # an over-corrected highlight is no shadow
         return replace(again, visibility=lit)
-
-    def _matt(
-        self,
-        scene: Scene,
-        points: Float[Tensor, "height width 3"],
-        on_object: ObjectLabels,
-        indirect: Indirect | None,
-    ) -> Scene | None:
-        """Return the photos without highlights; None where they are as good as they are."""
-        if scene.ground_known:
-            return without_highlights(scene, points, on_object, indirect or self._bounce(scene, points))
-        material = material_without_ground(scene, points, on_object)
-        return None if material is None else matt_photos(scene, points, on_object, material)
 
     def _with_powers(
         self, scene: Scene, points: Float[Tensor, "height width 3"], normals: Float[Tensor, "height width 3"]
