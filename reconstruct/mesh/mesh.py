@@ -17,7 +17,6 @@ from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.appearance.brdf import MetalRough, metal_rough
 from reconstruct.fields import SolvedScene
 from reconstruct.mesh.evidence import vertex_evidence
-from reconstruct.mesh.facets import faced, flipped
 from reconstruct.mesh.glb import Y_UP, metres, write_glb
 from reconstruct.render.g_buffer import material_at, seen_material, surface_maps
 from reconstruct.sdf.grid import SdfGrid
@@ -26,7 +25,6 @@ MAX_NODES = 400**3  # nodes around the object: beyond, marching cubes alone take
 PREVIEW_NODES = 96**3  # 30 thousand faces, which a browser can draw several times a second
 ISLAND_SHARE = 0.01  # of the largest piece's volume: smaller ones are debris,
 SEEN_SHARE = 0.005  # unless a camera sees one in as many of the object's pixels: an ear's tip, a hand, a thin rail
-ROUNDS = 2  # of moving vertices and turning edges: a third changes normals by less than .02 degrees
 OFF_SURFACE = 0.01  # voxels: nodes closer to the surface are moved, because their triangles would have no area
 
 Seen = Callable[[], Sequence[Float[np.ndarray, "_ 3"]]]  # where each view's rays meet the object first, world
@@ -42,7 +40,7 @@ def extract_mesh(fields: SolvedScene, max_nodes: int = MAX_NODES) -> trimesh.Tri
         ReconstructionError: there is no surface above the ground, it is not closed, or the grid around the object has
             more than max_nodes nodes.
     """
-    mesh = surface_mesh(fields.grid, fields.ground_height, max_nodes, True, lambda: seen_points(fields))
+    mesh = surface_mesh(fields.grid, fields.ground_height, max_nodes, lambda: seen_points(fields))
     vertices = torch.from_numpy(np.asarray(mesh.vertices)).float()
     albedo, _ = material_at(seen_material(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
     mesh.visual = ColorVisuals(mesh, vertex_colors=encode_srgb(albedo.numpy()))
@@ -71,13 +69,10 @@ def preview_mesh(grid: SdfGrid, ground_height: float, max_nodes: int = PREVIEW_N
         return None
 
 
-def surface_mesh(
-    grid: SdfGrid, ground_height: float, max_nodes: int, is_faced: bool = False, seen: Seen = lambda: ()
-) -> trimesh.Trimesh:
+def surface_mesh(grid: SdfGrid, ground_height: float, max_nodes: int, seen: Seen = lambda: ()) -> trimesh.Trimesh:
     """Return the uncoloured surface above the ground, world frame: closed, with a flat base exactly on the ground.
 
     Args:
-        is_faced: triangles face as the distances say, see reconstruct.mesh.facets; not where cuts have sharp rims.
         seen: is asked if a piece is small enough for debris: it stays if a camera sees much of it.
 
     Raises:
@@ -92,12 +87,6 @@ def surface_mesh(
     voxels = np.stack([np.interp(index[:, a], np.arange(len(axes[a])), axes[a]) for a in range(3)], 1)
     lowest = np.append(grid.origin[:2].double().numpy(), ground_height)
     vertices = lowest + grid.spacing * voxels
-    on_cut = vertices[:, 2] < ground_height + OFF_SURFACE * grid.spacing
-    if is_faced:
-        for _ in range(ROUNDS):
-            vertices = faced(grid, vertices, faces, on_cut)
-            faces = flipped(grid, vertices, faces, on_cut)
-        vertices[:, 2] = np.maximum(vertices[:, 2], ground_height)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     if not (mesh.is_watertight and mesh.volume > 0):
         raise ReconstructionError(
