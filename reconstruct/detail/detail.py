@@ -23,7 +23,7 @@ from reconstruct.detail.full_photos import BYTES_PER_SAMPLE, CHANNELS, FullPhoto
 from reconstruct.detail.surface import LitMap, SeenSurface, find_lit, merged, see_surface
 from reconstruct.fields import SolvedScene
 from reconstruct.labels.field_ground_test import label_ground
-from reconstruct.labels.photometric_stereo import ground_light, with_free_powers
+from reconstruct.labels.photometric_stereo import ground_light
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.render.interreflection import photo_interreflection
 from reconstruct.scene import Scene, irradiance
@@ -56,8 +56,6 @@ def estimate_illumination(scene: Scene, fields: SolvedScene) -> Illumination:
     ground = label_ground(scene) if scene.ground_known else None
     noise = DEFAULT_NOISE if ground is None else ground.noise
     maps = surface_maps(fields.grid, replace(scene.posed_camera, ground_height=fields.ground_height))
-    if ground is not None:
-        scene = with_free_powers(scene, torch.where(maps.mask[..., None], maps.points, torch.nan), maps.normals, ground)
     interreflection = photo_interreflection(fields, scene) if fields.interreflection > 0 else None
     if interreflection is not None:
         return Illumination(

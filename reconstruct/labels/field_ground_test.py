@@ -35,11 +35,6 @@ from reconstruct.shading.noise import Noise
 GAP_CONFIDENCE = 0.2  # of the mask where a pixel may be ground in a gap as well as object
 EXPLAINED = 0.7  # of the picture: a light model that makes ground of so much needs no other
 GAINED = 0.2  # of the picture: how much more of it the field must make ground
-# Log units: powers that are off by less on the ground near the object are better than those that the object shows. On a
-# rendered rock whose powers were changed by 0.07 they still were (normals 6.5 and 7.3 degrees); not on a kitchen table
-# with 0.088 (9.8 and 7.8).
-POWERS_OFF = 0.075
-SAMPLES = 4000  # pixels near the object that tell it
 FOLLOWS = 0.5  # share of the photos from which a pixel counts as ground of the field
 LIT, DARK = 0.7, 0.25  # visibility above and below which ground is called lit and in shadow
 GREY_CONFIDENCE = 0.3  # between them, where no shadow's edge runs through
@@ -51,16 +46,14 @@ BACKGROUND = 0.01  # of the picture: a smaller part that is no ground is a stain
 SECTORS = 72  # of the view from the point below the camera, in which the ground ends at the nearest background
 NEAREST = 5.0  # per cent of a sector's background that may be nearer
 TOO_BRIGHT, MANY = 0.5, 3  # log units: a highlight; in so many photos, ground whose albedo is that of its shadow
-AMBIENT_SHARE = 0.7  # of the light in shadows on the ground: the rest comes from the lit ground and the object
 
 
 def label_ground(scene: Scene) -> GroundTest:
     """Classify pixels as object or ground, and label the shadows on it: by the lights' model, or by a field of light.
 
     The outline is the field's, to which the model is one more witness, see _witness; it is the model's where the field
-    tells none. The model's light is used unless it makes much less of the picture ground than the field does, or the
-    photos' powers contradict it, see _powers_off. How quiet the fits are is no evidence: the field bends to what it is
-    fitted to, and so do the model's gains.
+    tells none. The model's light is used unless it makes much less of the picture ground than the field does. How quiet
+    the fits are is no evidence: the field bends to what it is fitted to.
 
     Raises:
         ValueError: the scene has no photos (scene.rgb is None).
@@ -87,7 +80,7 @@ def label_ground(scene: Scene) -> GroundTest:
     bare = bare_ground(whole, _witness(by_model))
     if not bare.shadows.object_mask.any():
         return by_model
-    if follows_more or _powers_off(scene, field, by_model) >= POWERS_OFF:
+    if follows_more:
         return _by_field(scene, bare)
     return test_ground(scene, background, _mask(scene, bare))
 
@@ -98,26 +91,6 @@ def _with_dark_samples(field: GroundField, usable: Bool[np.ndarray, "photos heig
     dark = usable & ~field.usable & (lit + SHADOW > np.log(DARKEST))
     residual = np.where(dark, np.log(DARKEST) - lit, field.residual).astype(np.float32)
     return replace(field, usable=field.usable | dark, residual=residual)
-
-
-def _powers_off(scene: Scene, field: GroundField, tested: GroundTest) -> float:
-    """Return how far the model's lights are off in brightness: root mean square over photos, log units.
-
-    For each photo the median, over lit ground near the object, of the field's light less that of the model. The model
-    was fitted to the whole ground with a fixed beam and tone curve; what it misses here of the photo's brightness it
-    misses on the object, whose normals come out wrong by it, while with the field each photo's power is free.
-    """
-    near = torch.from_numpy(np.flatnonzero(_near(tested.mask.numpy() > 0.5)))
-    near = near[:: max(1, len(near) // SAMPLES)]
-    light, lit, sure = (
-        maps.reshape(len(field.light), -1)[:, near]
-        for maps in (torch.from_numpy(field.light), tested.visibility, tested.confidence)
-    )
-    ratio = light - _modelled(scene, ground_points(scene).reshape(-1, 3)[near])
-    known = (lit > LIT) & (sure > 0) & ratio.isfinite()
-    typical = torch.where(known, ratio, torch.nan).nanmedian(1).values
-    typical = typical[typical.isfinite()]
-    return float((typical - typical.median()).square().mean().sqrt()) if len(typical) else 0.0
 
 
 def _witness(by_model: GroundTest) -> Int8[np.ndarray, "height width"]:
@@ -145,7 +118,7 @@ def _by_field(scene: Scene, bare: BareGround) -> GroundTest:
     trusted &= may_hold_shadow(scene, mask > 0.5).numpy()
     beside = dilated(mask > 0.5, 2 * RIM + 1)
     confidence *= torch.from_numpy(trusted) * (1 - mask) * torch.where(beside, RIM_SHARE, 1.0)
-    gain, scale = _gain(scene, bare.field, region)
+    scale = _scale(scene, bare.field, region)
     lit = ((visibility > LIT) & (confidence > 0)).float()
     noise = Noise(NOISE_FLOOR, max(TONE_SHARE, field.noise()))
     return GroundTest(
@@ -154,10 +127,8 @@ def _by_field(scene: Scene, bare: BareGround) -> GroundTest:
         visibility,
         confidence,
         _albedo(scene, bare.field, scale, lit),
-        gain,
         noise,
-        bare=bare,
-        ambient=_ambient(bare, region, scale),
+        None if field.beyond is None else torch.from_numpy(field.beyond),
     )
 
 
@@ -236,15 +207,12 @@ def _background(
     return behind & ~region
 
 
-def _gain(
-    scene: Scene, field: GroundField, region: Bool[np.ndarray, "height width"]
-) -> tuple[Float[Tensor, "photos height width"], float]:
-    """Return the gain of GroundTest, 1 near the object in the middle of the photos; and the field's log of albedo 1."""
+def _scale(scene: Scene, field: GroundField, region: Bool[np.ndarray, "height width"]) -> float:
+    """Return the field's log of albedo 1: the median of its light near the object over that of the lights' model."""
     light = torch.from_numpy(field.light)
     ratio = light - _modelled(scene, ground_points(scene).reshape(-1, 3)).reshape(light.shape)
     near = ratio[:, torch.from_numpy(_near(region))]
-    scale = float(near[near.isfinite()].median()) if near.isfinite().any() else 0.0
-    return (ratio - scale).nan_to_num(0.0).exp(), scale
+    return float(near[near.isfinite()].median()) if near.isfinite().any() else 0.0
 
 
 def _modelled(scene: Scene, points: Float[Tensor, "n 3"]) -> Float[Tensor, "photos n"]:
@@ -264,9 +232,3 @@ def _albedo(
     light = lit * torch.from_numpy(field.light - scale).exp()
     expected = torch.einsum("khw,kc->hwc", light, scene.tint)
     return torch.einsum("khw,khwc->hwc", lit, scene.rgb) / expected.clamp(min=1e-12)
-
-
-def _ambient(bare: BareGround, region: Bool[np.ndarray, "height width"], scale: float) -> float:
-    """Return the irradiance of everything but the light, from the shadows near the object."""
-    dark = bare.field.light[:, _near(region)] + bare.shadows.dark_level[:, None]
-    return AMBIENT_SHARE * float(np.exp(np.median(dark) - scale))

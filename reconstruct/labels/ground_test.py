@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from calibration.ground.ground_shadows import BareGround
 from reconstruct.labels.ground_colour import brightest_albedo, ground_around
 from reconstruct.labels.level_tops import find_level_tops
 from reconstruct.labels.matting import coverage_at_edges
@@ -38,7 +37,7 @@ PENUMBRA = 3  # px: such parts are wider
 FEWEST_SAMPLES = 3  # seen samples that a pixel needs to be classified
 RIM, RIM_SHARE = 2, 0.4  # px around a found mask, and the share of their confidence that ground labels keep there
 PIXELS_AT_ONCE = 32768  # of the irradiance, which needs six numbers per pixel and photo
-GAIN_FIT_PIXELS = 4000  # ground pixels that a photo's six gain coefficients are fitted to
+NOISE_PIXELS = 4000  # that the noise of lit samples is estimated from
 
 
 @dataclass(frozen=True)
@@ -50,12 +49,9 @@ class GroundTest:
     visibility: Float[Tensor, "photos height width"]  # of the ground; grey in penumbrae and on pixels cut by an edge
     confidence: Float[Tensor, "photos height width"]  # 0 off the ground
     albedo: Float[Tensor, "height width 3"]  # relative to Scene.power; 0 off the ground
-    gain: Float[Tensor, "photos height width"]  # actual irradiance of the ground over the modelled one; near 1
     noise: Noise
     background: Bool[Tensor, "height width"] | None = None  # neither object nor ground: beyond the table's edge
     explained: float = 1.0  # share of the pixels with light and ground to compare with that behave as ground
-    bare: BareGround | None = None  # what a field of light says, where it made the labels and not the lights' model
-    ambient: float = 0.0  # irradiance of everything but the light, as that field's shadows show it
 
 
 @dataclass(frozen=True)
@@ -87,8 +83,7 @@ def test_ground(
     """Classify pixels as object or ground, and label the shadows on the ground.
 
     A ground pixel has two values: I_k = albedo * (irradiance_k + ambient) when lit, a small one in shadow. The albedo
-    is the densest cluster of I_k / irradiance_k. A smooth gain per photo absorbs errors of its light model, so that a
-    light that is off by a few per cent does not make the whole ground fail. Level tops of the object pass this test;
+    is the densest cluster of I_k / irradiance_k. Level tops of the object pass this test;
     find_level_tops tells them from the ground. A given scene.mask is kept, and an `outline` that others found;
     `background` is known to show neither.
 
@@ -97,7 +92,7 @@ def test_ground(
     """
     if scene.rgb is None:
         raise ValueError("the ground test needs photos; shadow pictures are labels already")
-    behaves, gain, noise = _behaviour(scene)
+    behaves, noise = _behaviour(scene)
     if background is not None:
         between, level = (torch.where(background, 0.0, image) for image in (behaves.between, behaves.level))
         behaves = replace(behaves, between=between, level=level)
@@ -112,27 +107,26 @@ def test_ground(
     if scene.mask is None:  # missed parts of the object lie beside the mask; a false lit pixel there would carve them
         confidence *= torch.where(dilated(mask > 0.5, 2 * RIM + 1), RIM_SHARE, 1.0)
     strange = float(((behaves.between >= NOT_GROUND) & behaves.known).sum() / behaves.known.sum().clamp(min=1))
-    return GroundTest(mask, mask_confidence, visibility, confidence, albedo, gain, noise, background, 1 - strange)
+    return GroundTest(mask, mask_confidence, visibility, confidence, albedo, noise, background, 1 - strange)
 
 
-def _behaviour(scene: Scene) -> tuple[_Behaviour, Float[Tensor, "photos height width"], Noise]:
-    """Return the behaviour of the pixels, the gain of GroundTest, and the noise; the samples are not kept."""
+def _behaviour(scene: Scene) -> tuple[_Behaviour, Noise]:
+    """Return the behaviour of the pixels, and the noise; the samples are not kept."""
     samples = _samples(scene)
     shape = scene.directions.shape[:2]
-    gain = _smooth_gain(scene, samples)
-    level = _lit_level(samples, gain)
-    lit_value = (level * gain).mul_(samples.expected)
+    level = _lit_level(samples)
+    lit_value = level * samples.expected
     relative = (samples.value / lit_value.clamp(min=1e-12)).nan_to_num_()
     noise = _noise(samples, relative, shape)
     seen = samples.usable & (lit_value > SEEN_SIGMAS * noise.floor)
     between = _share_between(relative, seen, lit_value, noise).reshape(shape)
     level = level.reshape(shape)
-    relative, seen, gain, lit_value = (x.reshape(-1, *shape) for x in (relative, seen, gain, lit_value))
+    relative, seen, lit_value = (x.reshape(-1, *shape) for x in (relative, seen, lit_value))
     lit = (seen & ((relative - 1).abs() < LIT_BAND)).float()
-    albedo, ever_lit = _albedo(scene, samples, gain, lit), lit.sum(0) > 0
+    albedo, ever_lit = _albedo(scene, samples, lit), lit.sum(0) > 0
     del lit
     known = _known(level, seen, between, samples)
-    return _Behaviour(between, albedo, known, relative, seen, lit_value, level, ever_lit), gain, noise
+    return _Behaviour(between, albedo, known, relative, seen, lit_value, level, ever_lit), noise
 
 
 def _samples(scene: Scene) -> _Samples:
@@ -153,12 +147,12 @@ def _samples(scene: Scene) -> _Samples:
     return _Samples(grey_of(scene.rgb).reshape(n_photos, -1), expected, usable)
 
 
-def _lit_level(samples: _Samples, gain: Float[Tensor, "photos n"]) -> Float[Tensor, " n"]:
+def _lit_level(samples: _Samples) -> Float[Tensor, " n"]:
     """Estimate each pixel's albedo as ground: the mean of the densest cluster of its samples, 0 if there is none."""
     levels = []
-    for start in range(0, gain.shape[1], PIXELS_AT_ONCE):
+    for start in range(0, samples.value.shape[1], PIXELS_AT_ONCE):
         part = slice(start, start + PIXELS_AT_ONCE)
-        ratio = samples.value[:, part] / (gain[:, part] * samples.expected[:, part])
+        ratio = samples.value[:, part] / samples.expected[:, part]
         levels.append(_densest(torch.where(samples.usable[:, part], ratio, torch.zeros(())).T.contiguous()))
     return torch.cat(levels)
 
@@ -176,33 +170,9 @@ def _densest(ratio: Float[Tensor, "n photos"]) -> Float[Tensor, " n"]:
     return torch.where(level > 2 * dust, level, torch.zeros(()))
 
 
-def _smooth_gain(scene: Scene, samples: _Samples) -> Float[Tensor, "photos n"]:
-    """Fit one gain per photo to its lit ground samples: exp of a quadratic in the pixel's position; fitted twice."""
-    height, width = scene.directions.shape[:2]
-    v, u = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
-    u, v = u.reshape(-1), v.reshape(-1)
-    basis, step = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v], -1), max(1, len(u) // GAIN_FIT_PIXELS)
-    picked = slice(step // 2, None, step)
-    some = _Samples(samples.value[:, picked], samples.expected[:, picked], samples.usable[:, picked])
-    rows, gain = basis[picked], torch.ones_like(some.value)
-    solved = torch.zeros(len(gain), basis.shape[1])
-    for _ in range(2):
-        level = _lit_level(some, gain)
-        ratio = some.value / (some.expected * level).clamp(min=1e-12)
-        inlier = some.usable & ((ratio / gain - 1).abs() < LIT_BAND)
-        weight = (inlier & (inlier.float().mean(0) > 0.5)).float()  # mostly lit: ground, not object
-        logs = torch.where(weight > 0, ratio, torch.ones(())).log()
-        ridge = (1e-3 * weight.sum(1) + 1e-6)[:, None, None] * torch.eye(basis.shape[1])
-        normal = torch.einsum("kn,na,nb->kab", weight, rows, rows) + ridge
-        enough = weight.sum(1) > 10 * basis.shape[1]
-        solved = torch.linalg.solve(normal, torch.einsum("kn,na->ka", weight * logs, rows)) * enough[:, None]
-        gain = (solved @ rows.T).clamp(-LIT_BAND, LIT_BAND).exp()
-    return (solved @ basis.T).clamp(-LIT_BAND, LIT_BAND).exp()
-
-
 def _noise(samples: _Samples, relative: Float[Tensor, "photos n"], shape: torch.Size) -> Noise:
     """Estimate noise by the median absolute deviation: floor from neighbours in shadow, share from lit samples."""
-    step = max(1, relative[0].numel() // GAIN_FIT_PIXELS)
+    step = max(1, relative[0].numel() // NOISE_PIXELS)
     usable, rest = samples.usable[:, ::step], relative[:, ::step]
     lit = (rest - 1)[usable & ((rest - 1).abs() < LIT_BAND)].abs()
     share = 1.48 * float(lit.median()) if lit.numel() else LIT_BAND
@@ -332,11 +302,11 @@ def _visibility_in_photo(
 
 
 def _albedo(
-    scene: Scene, samples: _Samples, gain: Tensor, lit: Float[Tensor, "photos height width"]
+    scene: Scene, samples: _Samples, lit: Float[Tensor, "photos height width"]
 ) -> Float[Tensor, "height width 3"]:
     """Colour over expected colour of the lit samples, all taken together."""
     assert scene.rgb is not None
-    direct = (gain * samples.expected.reshape(lit.shape) - scene.ambient.mean()).clamp(min=0)
+    direct = (samples.expected.reshape(lit.shape) - scene.ambient.mean()).clamp(min=0)
     expected = torch.einsum("khw,kc->hwc", lit * direct, scene.tint) + lit.sum(0)[..., None] * scene.ambient
     return torch.einsum("khw,khwc->hwc", lit, scene.rgb) / expected.clamp(min=1e-12)
 
@@ -348,4 +318,4 @@ def empty_ground_test(scene: Scene) -> GroundTest:
     shape = scene.rgb.shape[:3]
     mask = scene.mask if scene.mask is not None else bright_object(scene.rgb)
     nothing, albedo = torch.zeros(shape), torch.zeros(*shape[1:], 3)
-    return GroundTest(mask, torch.ones(shape[1:]), nothing, nothing, albedo, torch.ones(shape), DEFAULT_NOISE)
+    return GroundTest(mask, torch.ones(shape[1:]), nothing, nothing, albedo, DEFAULT_NOISE)

@@ -150,8 +150,8 @@ def with_lit_ground(
 ) -> Float[Tensor, "height width 3"]:
     """Return the albedo with that of ground in which the ground test found no lit sample, such as edges of print.
 
-    It is fitted to the photos whose light reaches the place past the surface, with the test's gains. Where none does,
-    and beyond the ground's end, the albedo stays 0.
+    It is fitted to the photos whose light reaches the place past the surface. Where none does, and beyond the ground's
+    end, the albedo stays 0.
 
     Args:
         points, normals: what each pixel sees, world; normal 0 on the ground.
@@ -159,8 +159,8 @@ def with_lit_ground(
     if not scene.ground_known:
         return albedo
     where = (albedo == 0).all(-1) & (normals == 0).all(-1) & points.isfinite().all(-1)
-    for end in (ground.background, None if ground.bare is None else ground.bare.field.beyond):
-        where &= True if end is None else ~torch.as_tensor(end)
+    if ground.background is not None:
+        where &= ~ground.background
     out, no_light = albedo.clone(), from_endless_ground(torch.zeros(len(scene.lights)))
     for pixels in _blocks(where, len(scene.lights)):
         at = points[pixels]
@@ -168,7 +168,7 @@ def with_lit_ground(
         lit = unshadowed(grid, at, scene.lights) > SURELY_LIT
         part = gather(scene, at, up, pixels, lit.float(), no_light)
         arriving = part.strength * part.towards[..., 2:] + part.indirect
-        out[pixels] = least_squares_albedo(part.value, arriving * ground.gain[:, *pixels].T[..., None], part.weight)
+        out[pixels] = least_squares_albedo(part.value, arriving, part.weight)
     return out
 
 

@@ -26,7 +26,7 @@ from reconstruct.labels.labels import Labels, assemble_labels
 from reconstruct.labels.lit_labels import with_lit_normals
 from reconstruct.labels.multiple_lights import check_lights, is_shared, split_on_surface
 from reconstruct.labels.outline import Outline, outline_of, unsure_outline
-from reconstruct.labels.photometric_stereo import ObjectLabels, ground_light, label_object, with_free_powers
+from reconstruct.labels.photometric_stereo import ObjectLabels, ground_light, label_object
 from reconstruct.labels.uneven_ground import cut_at_relief, ground_relief, ground_visibility
 from reconstruct.render.interreflection import photo_interreflection, true_scale
 from reconstruct.scene import Scene, ground_points, light_share
@@ -74,7 +74,6 @@ class Observer:
         if is_shared(scene):
             scene = split_on_surface(scene, surface, points, normals, self._ground)
             self._ground = test_ground(scene)
-        scene = with_free_powers(scene, points, normals, self._ground)
         on_object = self._on_object(surface, scene, points, normals)
         return self._beside_relief(assemble_labels(scene, self._ground, on_object), surface)
 
@@ -112,10 +111,10 @@ class Observer:
     def _with_powers(
         self, scene: Scene, points: Float[Tensor, "height width 3"], normals: Float[Tensor, "height width 3"]
     ) -> Scene:
-        """Return the scene with the power of each photo as the ground shows it, or without a ground the object."""
+        """Return the scene with the power of each photo as the object shows it, where there is no ground."""
         assert self._ground is not None
         if scene.ground_known:
-            return with_free_powers(scene, points, normals, self._ground)
+            return scene
         on_object = label_object(scene, points, normals, self._ground.mask, self._ground)
         material = material_without_ground(scene, points, on_object)
         return scene if material is None else with_powers(scene, material)

@@ -28,11 +28,6 @@ FEWEST_INLIERS, ENOUGH_INLIERS = 4.0, 10.0  # effective photos behind a normal: 
 FEWEST_SHARE, ENOUGH_SHARE = 0.3, 0.7  # of the photos, if that is fewer: then albedo and surface must help out
 EXPLAINED, UNEXPLAINED = 1.0, 4.0  # misfit of a pixel up to which its labels count in full, and from which not at all
 USUAL_MISFIT = 0.25  # of the object's pixels, median; where it is larger, these two grow with it
-POWER_PIXELS, POWER_ROUNDS = 1200, 5  # of the fit of powers
-POWER_TRUST = 0.5  # in the ground's word on powers: parallax and the beam make it miss half of what it says
-POWER_PRIOR = 0.07  # weight of that word in every round
-SURELY_FACING, LIT_RATIO = 0.25, 0.4  # cosine to the light, and least share of the expected value, of a lit sample
-RING = 1.0  # of the object's size in the picture: width of the ground that is near it
 EDGE_SHARE = 0.25  # of the confidence on mask-edge pixels, which mix two surfaces
 
 
@@ -198,71 +193,6 @@ def ground_light(
     bounce = _ground_bounce(scene, points[where], ground)
     noise = DEFAULT_NOISE if ground is None else ground.noise
     return bounce * _bounce_scale(scene, points, torch.nonzero(where), bounce, noise)
-
-
-def with_free_powers(
-    scene: Scene,
-    points: Float[Tensor, "height width 3"],
-    normals: Float[Tensor, "height width 3"] | None,
-    ground: GroundTest,
-) -> Scene:
-    """Return the scene with a power per photo as the object shows it, and ambient light as shadows on the ground do.
-
-    Where a beam or a phone's tone curve is not known, the ground tells little of the light on the object. Powers and
-    normals are fitted in turn [semi-calibrated photometric stereo: Cho, Matsushita, Tai and Kweon, ECCV 2016], from
-    a start and a prior half way, in logarithms, between the scene's powers and those that the ground near the object
-    asks for. The powers' common factor, which the albedo takes, is kept. Scenes whose ground follows the model of
-    their lights are returned as they are.
-
-    Args:
-        points: world, the current surface; used where ground.mask > 0.5.
-        normals: of that surface, world, 0 where unknown; None if there is no surface yet.
-        ground: whose field says that the lights' model does not hold.
-    """
-    where = (ground.mask > 0.5) & points.isfinite().all(-1)
-    if ground.bare is None or not where.any():
-        return scene
-    places = torch.nonzero(where)
-    places = places[:: max(1, len(places) // POWER_PIXELS)]
-    asked = POWER_TRUST * _nearby_gain(ground)
-    given = scene.power
-    lit = replace(scene, ambient=torch.full((3,), ground.ambient), power=given * asked.exp()[:, None])
-    bounce = ground_light(lit, points, where, ground)
-    found = asked
-    for _ in range(POWER_ROUNDS):
-        lit = replace(lit, power=given * found.exp()[:, None])
-        some = _gather(lit, points, places, bounce * (found - asked).exp(), ground.noise)
-        off = _power_errors(some, None if normals is None else normals[places[:, 0], places[:, 1]])
-        found = (1 - POWER_PRIOR) * (found + off) + POWER_PRIOR * asked
-        found = found - (found - asked).median()
-    return replace(lit, power=given * found.exp()[:, None])
-
-
-def _power_errors(pixels: Pixels, guess: Float[Tensor, "n 3"] | None) -> Float[Tensor, " photos"]:
-    """Return the log of each photo's light over the modelled one: the median over lit samples; 0 without any."""
-    solved, _ = fit_normals(pixels)
-    albedo = torch.linalg.vector_norm(solved, dim=-1).clamp(min=1e-6)
-    if guess is not None:
-        solved, _ = fit_normals(pixels, Prior(albedo, guess))
-        albedo = torch.linalg.vector_norm(solved, dim=-1).clamp(min=1e-6)
-    normal = solved / albedo[:, None]
-    cosine = (pixels.towards @ normal[..., None])[..., 0]
-    direct = albedo[:, None] * pixels.strength * cosine
-    seen = pixels.value - albedo[:, None] * indirect_light(pixels, normal)
-    ratio = seen / direct.clamp(min=1e-12)
-    lit = pixels.usable & (cosine > SURELY_FACING) & (ratio > LIT_RATIO) & (ratio < 1 / LIT_RATIO)
-    logs = torch.where(lit, ratio.clamp(min=1e-6).log(), torch.nan)
-    return logs.nanmedian(0).values.nan_to_num(0.0)
-
-
-def _nearby_gain(ground: GroundTest) -> Float[Tensor, " photos"]:
-    """Return the median log gain of the lit ground near the object in each photo, 0 where none is lit."""
-    lit = (ground.visibility > 0.5) & (ground.confidence > 0.5)
-    logs = torch.where(lit, ground.gain.clamp(min=1e-6).log(), torch.nan)
-    size = float((ground.mask > 0.5).sum()) ** 0.5
-    reach = 2 * round(RING * size) + 1
-    near = dilated(ground.mask > 0.5, reach)
-    return logs[:, near].nanmedian(1).values.nan_to_num(0.0)
 
 
 def _ground_bounce(scene: Scene, surface: Float[Tensor, "n 3"], ground: GroundTest | None) -> Float[Tensor, " photos"]:
