@@ -94,12 +94,6 @@ def joined_scenes(scenes: Scenes, object_poses: ObjectPoses, placed: tuple[Place
     return (*scenes, *moved)
 
 
-def forget_object_poses(run: RunFolder) -> None:
-    """Remove the files of the poses' own solves."""
-    for path in run.path.glob(f"{KEPT_OBJECT_POSE}_*"):
-        run.discard(path.name)
-
-
 @dataclass(frozen=True)
 class _SmallSolves:
     """Small solves of poses, kept in the run folder, so that a run that was stopped does not repeat them."""
@@ -310,7 +304,7 @@ def solve(
     if steering.was_stopped:
         run.is_left_open = True
     else:
-        forget_object_poses(run)
+        run.discard(f"{KEPT_OBJECT_POSE}_*")
     run.reopen("mesh", "detail")  # of a surface that was stopped earlier
     return replace(solved, doubts=(*solved.doubts, *doubts))
 

@@ -143,9 +143,10 @@ class RunFolder:
         """Write a JSON result atomically."""
         write_json(self.path / name, value)
 
-    def discard(self, name: str) -> None:
-        """Remove a file or folder that is no longer needed."""
-        _remove(self.path / name)
+    def discard(self, *names: str) -> None:
+        """Remove files and folders that are no longer needed; a * stands for any letters."""
+        for path in [path for name in names for path in self.path.glob(name)]:
+            _remove(path)
 
     # --- resuming ----------------------------------------------------------------------------------------------------
 
@@ -187,12 +188,10 @@ class RunFolder:
 
     def forget(self, *stages: str) -> None:
         """Mark these stages to run again from the beginning."""
+        self.reopen(*stages)
         for stage in stages:
             self.costs.pop(stage, None)
-            if self.is_finished(stage):
-                self._manifest["finished"].remove(stage)
-        for path in [self.path / "config.json", self.path / PLAN, *self.path.glob("checkpoint*")]:
-            _remove(path)
+        self.discard("config.json", PLAN, "checkpoint*")
 
     def reopen(self, *stages: str) -> None:
         """Mark these stages to run again: their files are valid results, but not final."""
@@ -329,11 +328,7 @@ class RunFolder:
 
     def _start_again(self) -> None:
         """Forget the earlier run: its log, checkpoints and finished stages. Its results are overwritten later."""
-        for path in [
-            *(self.path / name for name in (LOG, "preview.ply", "config.json", KEPT, PLAN)),
-            *self.path.glob("checkpoint*"),
-        ]:
-            _remove(path)
+        self.discard(LOG, "preview.ply", "config.json", KEPT, PLAN, "checkpoint*")
         self._manifest, self.costs = {}, {}
         self._t0, self._cpu0 = self._now(), cpu_seconds()
 
