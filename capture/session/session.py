@@ -18,16 +18,7 @@ from capture.files.regular import why
 from capture.files.schema import Number, Positive, Text, Vector, as_type
 from capture.photos.finding import Finding, grouped
 from capture.session.clip import choose_board_frames, choose_frames
-from capture.session.declared_objects import (
-    MOST_LIGHTS,
-    Cube,
-    Height,
-    Peg,
-    PhoneBack,
-    Solid,
-    Thickness,
-    parse_height,
-)
+from capture.session.declared_objects import MOST_LIGHTS, Cube, Height, Peg, PhoneBack, Solid, Thickness, parse_height
 from capture.session.roles import NoBoardError, Roles
 from capture.session.seen import SeenPhotos
 from capture.session.sorting import (

@@ -237,11 +237,7 @@ def seen_views(photos: Sequence[Photos], calibrated: CalibratedViews) -> tuple[t
 
 
 def prepare_scene(
-    source: Source,
-    photos: Sequence[Photos],
-    calibrated: CalibratedViews,
-    options: RunOptions,
-    plan: Plan | None = None,
+    source: Source, photos: Sequence[Photos], calibrated: CalibratedViews, options: RunOptions, plan: Plan | None = None
 ) -> Scenes:
     """Return the photos and calibration of each calibrated view as torch tensors.
 
