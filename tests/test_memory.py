@@ -75,14 +75,14 @@ def test_a_run_keeps_to_its_decision_and_writes_which_photos_it_left_out(tmp_pat
     source = Source(tmp_path, known=KnownScene(calibration, (tmp_path / "a.png",) * 50, None, None))
     with RunFolder(tmp_path / "out") as run:
         for memory in (0.3, None):  # the second invocation finds more room, and goes on as before
-            plan = solve_stage._kept_plan(source, RunOptions(preset="draft", memory=memory), run)
+            plan = solve_stage.kept_plan(source, RunOptions(preset="draft", memory=memory), run)
             kept = solve_stage._within_memory(source, plan, run, CalibratedViews.of(calibration))
             thinned = kept.first
             assert sum(light.used for light in thinned.lights) == 40
             assert load_calibration(run.file("calibration.json")) == thinned
             assert plan and OVERRIDE in plan.sentence and "40 of 50 photos" in plan.sentence
         run.discard(PLAN)
-        plan = solve_stage._kept_plan(source, RunOptions(preset="draft", memory=64.0), run)
+        plan = solve_stage.kept_plan(source, RunOptions(preset="draft", memory=64.0), run)
         assert plan and OVERRIDE not in plan.sentence
         assert all(light.used for light in solve_stage._within_memory(source, plan, run, kept).first.lights)
         assert all(light.used for light in load_calibration(run.file("calibration.json")).lights)

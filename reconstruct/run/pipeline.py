@@ -39,7 +39,7 @@ from reconstruct.run.machine import kernels_are_compiled, measure_speed, planned
 from reconstruct.run.presets import solver_config
 from reconstruct.run.report_json import summary, versions
 from reconstruct.run.results import detail_is_asked, save_results, write_detail
-from reconstruct.run.solve_stage import solve
+from reconstruct.run.solve_stage import kept_plan, solve
 from reconstruct.run_folder.folder import KEPT, RunFolder, content_hash
 from reconstruct.run_folder.forecast import duration_text, plan_numbers
 from reconstruct.run_folder.progress import Lazy, log_to, once
@@ -74,6 +74,8 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
     if run.forgotten:
         run.progress("capture", message=f"forgotten, as the run starts anew: {', '.join(sorted(run.forgotten))}")
     _plan_time(source, options, run, stages)
+    if stages != "calibrate" and not run.is_finished("solve"):
+        kept_plan(source, options, run)  # before photos fill the memory
     photos = Lazy(lambda: _read(source, options, run))
     calibrated = Lazy(lambda: load_views(run.file(CALIBRATION)))
     fields = Lazy(lambda: load_fields(run.file(FIELDS)))
@@ -144,7 +146,7 @@ def _read(source: Source, options: RunOptions, run: RunFolder) -> tuple[Photos, 
 
 def _calibrated(source: Source, photos: Sequence[Photos], options: RunOptions, run: RunFolder) -> CalibratedViews:
     """Stage "calibrate"; small photos are named anew if the first view is left out."""
-    with log_to("calibration", run.activity, lambda text: run.progress(message=text)):
+    with log_to(run.activity, lambda text: run.progress(message=text)):
         calibrated = calibrate_source(source, photos, options)
     if len(photos) > 1 and photos[0].view != calibrated.views[0].name:
         write_thumbnails(source, run, calibrated.views[0].name)

@@ -277,7 +277,7 @@ def solve(
     while True:
         resolution, config = schedule(options, run, source)
         chosen = replace(options, preset=resolution)
-        plan = _kept_plan(source, chosen, run)
+        plan = kept_plan(source, chosen, run)
         calibrated = _within_memory(source, plan, run, calibrated)
         read = _photos_for(chosen, source, options, run, photos)
         scenes = prepare_scene(source, read, calibrated, chosen, plan)
@@ -305,11 +305,12 @@ def solve(
     return replace(solved, doubts=(*solved.doubts, *doubts))
 
 
-def _kept_plan(source: Source, options: RunOptions, run: RunFolder) -> Plan | None:
-    """Return what fits into memory, decided once for all invocations of a run; None for a trained field."""
+def kept_plan(source: Source, options: RunOptions, run: RunFolder) -> Plan | None:
+    """Return what fits into memory, decided and said once for all invocations of a run; None for a trained field."""
     plan = read_kept(run.file(PLAN), Plan)
     if plan is None and (plan := memory_plan(source, options)) is not None:
         run.write_json(PLAN, asdict(plan))
+        run.progress(message=plan.sentence)
     return plan
 
 
@@ -317,7 +318,6 @@ def _within_memory(source: Source, plan: Plan | None, run: RunFolder, calibrated
     """Return the calibrations with as many photos in use as the plan allows, and update calibration.json."""
     if plan is None:
         return calibrated
-    run.progress(message=plan.sentence)
     thinned = within_plan(calibrated, plan, len(source.photos()))
     used = [[x.used for one in some.every() for x in one.calibration.lights] for some in (calibrated, thinned)]
     if used[0] != used[1]:

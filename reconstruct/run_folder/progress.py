@@ -1,6 +1,6 @@
 """Stages that are done once: a later invocation of the same run reads their results back when needed.
 
-What packages log of their steps, for a progress display.
+What the calibration logs of its steps, for a progress display.
 """
 
 import logging
@@ -15,14 +15,13 @@ T = TypeVar("T")
 
 
 @contextmanager
-def log_to(package: str, say: Callable[[str], None], warn: Callable[[str], None]) -> Iterator[None]:
-    """Say what a package logs of its steps, as long as this lasts; of this thread alone, as runs may be side by side.
+def log_to(say: Callable[[str], None], warn: Callable[[str], None]) -> Iterator[None]:
+    """Say what the calibration logs of its steps while this lasts; of this thread alone, as runs may be side by side.
 
     Args:
-        package: name of its logger.
         warn: gets what it warns of; `say` gets the rest.
     """
-    logger, handler, thread = logging.getLogger(package), logging.Handler(logging.INFO), threading.get_ident()
+    logger, handler, thread = logging.getLogger("calibration"), logging.Handler(logging.INFO), threading.get_ident()
 
     def emit(record: logging.LogRecord) -> None:
         if record.thread == thread:
