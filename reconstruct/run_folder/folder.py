@@ -145,8 +145,9 @@ class RunFolder:
 
     def discard(self, *names: str) -> None:
         """Remove files and folders that are no longer needed; a * stands for any letters."""
-        for path in [path for name in names for path in self.path.glob(name)]:
-            _remove(path)
+        for path in list(self.path.iterdir()):
+            if any(path.match(name) for name in names):
+                _remove(path)
 
     # --- resuming ----------------------------------------------------------------------------------------------------
 
@@ -188,9 +189,10 @@ class RunFolder:
 
     def forget(self, *stages: str) -> None:
         """Mark these stages to run again from the beginning."""
-        self.reopen(*stages)
         for stage in stages:
             self.costs.pop(stage, None)
+            if self.is_finished(stage):
+                self._manifest["finished"].remove(stage)
         self.discard("config.json", PLAN, "checkpoint*")
 
     def reopen(self, *stages: str) -> None:

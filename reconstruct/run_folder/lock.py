@@ -46,15 +46,6 @@ def release_lock(folder: Path) -> None:
     (folder / LOCK).unlink(missing_ok=True)
 
 
-def is_abandoned(lock: Path) -> bool:
-    """Return True if a lock names a process that is gone; False if it cannot be read or is being written."""
-    try:
-        named = "pid" in read_json(lock)
-    except (OSError, ValueError, TypeError):
-        return False
-    return named and lock_holder(lock) is None
-
-
 def lock_holder(path: Path) -> int | None:
     """Return the id of the running process that holds this lock; None if it is gone or the file has no id."""
     try:
