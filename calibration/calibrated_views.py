@@ -4,7 +4,7 @@ The file is calibration.json as Calibration writes it, for the first view; those
 `further_views`, those of further object poses in `lies`. A reader that knows one view finds the first.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -47,6 +47,11 @@ class CalibratedViews:
         """Return the same views with other calibrations, in their order."""
         pairs = zip(self.views, calibrations, strict=True)
         return replace(self, views=tuple(replace(view, calibration=one) for view, one in pairs))
+
+    def changed(self, change: Callable[[Calibration], Calibration]) -> "CalibratedViews":
+        """Return the same views, those of all object poses included, each with its calibration changed."""
+        views = self.with_calibrations([change(view.calibration) for view in self.views])
+        return replace(views, object_poses=tuple(one.changed(change) for one in self.object_poses))
 
     @staticmethod
     def of(calibration: Calibration, name: str = "") -> "CalibratedViews":

@@ -167,7 +167,7 @@ def check(command: Check, console: Console) -> None:
         from reconstruct.run_folder.progress import log_to
         from viewer.report.check_page import check_lines, write_check
 
-        with log_to("calibration", display.activity, lambda text: print_lines(console, f"warning: {text}")):
+        with log_to(display.activity, lambda text: print_lines(console, f"warning: {text}")):
             checked = read_and_check(source, options)
     out = results_folder(command)
     written = write_check(checked, out)

@@ -44,12 +44,7 @@ def photographed() -> tuple[PosedCamera, np.ndarray, GroundField, GroundShadows]
     every = np.ones(lit.shape, bool)
     field = GroundField(flat, np.zeros(lit.shape, np.float32), np.where(lit, 0, -2).astype(np.float32), every, flat + 1)
     likelihood = np.where(mask, 1.0, -1.0).astype(np.float32)
-    return (
-        camera,
-        lights,
-        field,
-        GroundShadows(lit.astype(np.float32), np.full(len(lights), -2.0), likelihood, mask),
-    )
+    return (camera, lights, field, GroundShadows(lit.astype(np.float32), np.full(len(lights), -2.0), likelihood, mask))
 
 
 def drawn():

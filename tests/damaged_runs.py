@@ -183,39 +183,24 @@ def exchanged(draw: random.Random, document: Any) -> tuple[Any, str]:
         return document, f"{way} = {value!r:.30}"
 
 
-def by_numbers(draw: random.Random, run: Path) -> str:
-    """Numbers of a tensor that no scene has, or noise."""
-    path = _chosen(draw, run, TENSORS)
-    tensors, header = _stored(path)
-    name = draw.choice(sorted(tensors))
-    tensor = tensors[name].clone()
-    way = draw.choice(["one", "all", "noise", "scaled"])
-    if way == "noise":
-        tensor = (torch.randn(tensor.shape) * draw.choice([0.1, 1, 100])).to(tensor.dtype)
-    elif way == "scaled":
-        tensor = (tensor.double() * draw.choice([-1, 1e-12, 1e12, 1e3])).to(tensor.dtype)
-    else:
-        value = draw.choice(NUMBERS)
-        if not tensor.is_floating_point():
-            value = draw.choice([0, 1, -1, 255])
-        tensor.view(-1)[draw.randrange(tensor.numel()) if way == "one" else slice(None)] = value
-    _save(tensors | {name: tensor}, header, path)
-    return f"{path.name}: {name} {way}"
-
-
-def by_shape(draw: random.Random, run: Path) -> str:
-    """A tensor of another shape or type, missing, or under another name."""
+def by_tensor(draw: random.Random, run: Path) -> str:
+    """A tensor of numbers that no scene has, of another shape or type, missing, or under another name."""
     path = _chosen(draw, run, TENSORS)
     tensors, header = _stored(path)
     name = draw.choice(sorted(tensors))
     tensor = tensors.pop(name)
-    way = draw.choice(["missing", "renamed", "flat", "cut", "double", "empty", "transposed"])
-    if way == "renamed":
-        tensors["x" * 50] = tensor
-    elif way != "missing":
-        made = {"flat": tensor.reshape(-1), "cut": tensor[: len(tensor) // 2], "double": tensor.double()}
-        made |= {"empty": tensor[:0], "transposed": tensor.transpose(0, -1).contiguous()}
-        tensors[name] = made[way].contiguous()
+    value = draw.choice(NUMBERS if tensor.is_floating_point() else [0, 1, -1, 255])
+    spoilt = tensor.clone()
+    spoilt.view(-1)[draw.randrange(tensor.numel())] = value
+    ways = {"missing": None, "renamed": tensor, "one": spoilt, "all": torch.full_like(tensor, value)}
+    ways |= {"noise": torch.randn(tensor.shape) * draw.choice([0.1, 1, 100])}
+    ways |= {"scaled": tensor.double() * draw.choice([-1, 1e-12, 1e12, 1e3]), "double": tensor.double()}
+    ways |= {"flat": tensor.reshape(-1), "cut": tensor[: len(tensor) // 2], "empty": tensor[:0]}
+    way = draw.choice([*ways, "transposed"])
+    made = tensor.transpose(0, -1) if way == "transposed" else ways[way]
+    if made is not None:
+        made = made.to(tensor.dtype) if way in ("noise", "scaled") else made
+        tensors["x" * 50 if way == "renamed" else name] = made.contiguous()
     _save(tensors, header, path)
     return f"{path.name}: {name} {way}"
 
@@ -305,7 +290,7 @@ def by_log(draw: random.Random, run: Path) -> str:
 
 
 WAYS: tuple[Callable[[random.Random, Path], str], ...] = (
-    *(by_bytes, by_bytes, by_value, by_value, by_value, by_numbers, by_numbers, by_shape, by_header),
+    *(by_bytes, by_bytes, by_value, by_value, by_value, by_tensor, by_tensor, by_tensor, by_header),
     *(by_header, by_mesh, by_map, by_log),
     *STRANGE,
 )

@@ -14,6 +14,7 @@ from synthetic import HEAP, Look, Truth, grid_of, render
 from calibration.calibration import Calibration, save_calibration
 from capture.photos.photo import encode_srgb
 from reconstruct.fields import SolvedScene, save_fields
+from reconstruct.run_folder.lock import release_lock, take_lock
 
 SPACING = 2.0  # mm
 
@@ -60,7 +61,7 @@ def log_line(run_dir: Path, t: float, stage: str, done: float = 0, total: float 
 def start_run(run_dir: Path, truth: Truth) -> None:
     """As it is while the solver works: calibration, thumbnails, a growing mesh, a log."""
     run_dir.mkdir(parents=True, exist_ok=True)
-    (run_dir / "lock").write_text("{}")
+    take_lock(run_dir)
     calibration = calibration_of(truth)
     save_calibration(calibration, run_dir / "calibration.json")
     (run_dir / "thumbs").mkdir(exist_ok=True)
@@ -85,7 +86,7 @@ def finish_run(run_dir: Path, truth: Truth) -> None:
     Image.fromarray((255 * truth.mask).astype(np.uint8)).save(run_dir / "mask.png")
     (run_dir / "report.json").write_text(json.dumps(report_of(truth)))
     log_line(run_dir, 61.0, "done", 1, 1, "mesh.ply written")
-    (run_dir / "lock").unlink()
+    release_lock(run_dir)
 
 
 def report_of(truth: Truth) -> dict:

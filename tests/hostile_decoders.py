@@ -101,27 +101,20 @@ def answers_with_objects(file: BinaryIO) -> Iterator[Answer]:
     yield Answer(pixels=np.array([None, None]))
 
 
-def lies_about_the_size(file: BinaryIO) -> Iterator[Answer]:
-    yield from _says(b'{"numbers": [], "names": [], "shape": [100000, 100000, 3], "samples": "float32"}', file)
+LIES = (
+    b'{"numbers": [], "names": [], "shape": [100000, 100000, 3], "samples": "float32"}',
+    b'{"numbers": [], "names": [], "shape": [1], "samples": "object"}',
+    b'{"numbers": [NaN], "names": [], "shape": null, "samples": ""}',
+    b"\xff\xfe{",
+    b"[" * 60000,
+)
 
 
-def lies_about_the_kind(file: BinaryIO) -> Iterator[Answer]:
-    yield from _says(b'{"numbers": [], "names": [], "shape": [1], "samples": "object"}', file)
+def lies(file: BinaryIO, which: int) -> Iterator[Answer]:
+    yield from _says(LIES[which])
 
 
-def gives_numbers_that_are_none(file: BinaryIO) -> Iterator[Answer]:
-    yield from _says(b'{"numbers": [NaN], "names": [], "shape": null, "samples": ""}', file)
-
-
-def talks_nonsense(file: BinaryIO) -> Iterator[Answer]:
-    yield from _says(b"\xff\xfe{", file)
-
-
-def nests(file: BinaryIO) -> Iterator[Answer]:
-    yield from _says(b"[" * 60000, file)
-
-
-def _says(words: bytes, file: BinaryIO) -> Iterator[Answer]:
+def _says(words: bytes) -> Iterator[Answer]:
     """Answers past the module that would."""
     socket.socket(fileno=os.dup(0)).send(words)
     signal.pause()
@@ -134,4 +127,4 @@ def keeps_its_answer(file: BinaryIO) -> Iterator[Answer]:
 
     newest = file.fileno() - 1  # the memory for the answer was handed over with the file
     _held.append(mmap.mmap(newest, GRANTED))
-    yield from _says(b'{"numbers": [], "names": [], "shape": [8], "samples": "uint8"}', file)
+    yield from _says(b'{"numbers": [], "names": [], "shape": [8], "samples": "uint8"}')

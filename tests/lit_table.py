@@ -1,5 +1,6 @@
 """Photos of a textured table as pictures only (no geometry): what role finding and photo checks look at."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -64,6 +65,19 @@ def stack_of(photos: list[np.ndarray]) -> PhotoStack:
     rgb = np.stack(photos)
     paths = tuple(Path(f"IMG_{i}.jpg") for i in range(len(photos)))
     return PhotoStack(rgb, rgb.max(3) >= 0.99, paths, WIDTH, HEIGHT, (1.0,) * len(photos))
+
+
+def usual(count: int, seed: int = 1) -> PhotoStack:
+    """So many photos of the ball on its table."""
+    rng = np.random.default_rng(seed)
+    return stack_of(lit_photos(count, rng, with_object(table(rng))))
+
+
+def usual_board() -> PhotoStack:
+    """The board where the object will stand, in even light, on the table of `usual`."""
+    bare = with_board(table(np.random.default_rng(1)), TRIPOD_BOARD)
+    one = stack_of([photograph(0.6 * bare, np.random.default_rng(3))])
+    return replace(one, paths=(Path("board/IMG_0.jpg"),))
 
 
 def save_photo(path: Path, linear: np.ndarray, model: str = "Tripod", second: int = 0) -> Path:

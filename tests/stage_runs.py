@@ -8,10 +8,7 @@ from synthetic import HEAP, Box, Look, Sphere, Truth, render
 from calibration.calibration import save_calibration
 from reconstruct.fields import save_fields
 
-SHAPES = {
-    "heap": HEAP,
-    "lollipop": (Sphere((0.0, 0.0, 50.0), 24.0), Box((-6, -6, 0), (6, 6, 40))),
-}
+SHAPES = {"heap": HEAP, "lollipop": (Sphere((0.0, 0.0, 50.0), 24.0), Box((-6, -6, 0), (6, 6, 40)))}
 
 
 def truth_of(name: str) -> Truth:

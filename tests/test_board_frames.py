@@ -94,8 +94,7 @@ def test_a_frame_that_was_stored_mirrored_is_refused_as_such(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("spec", "bend"),
-    [(SPECS[2], 0.0), ("charuco:11x12:20:15:DICT_5X5_100", -0.25), ("checkerboard:13x9:20", -0.25)],
+    ("spec", "bend"), [(SPECS[2], 0.0), ("charuco:11x12:20:15:DICT_5X5_100", -0.25), ("checkerboard:13x9:20", -0.25)]
 )
 def test_stray_corners_bend_nothing_and_are_left_out(spec, bend):
     """Two sides of the board are seen; what lies inside them shows two corners of something else."""

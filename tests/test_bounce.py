@@ -82,9 +82,7 @@ def test_in_a_white_furnace_the_ball_receives_what_the_ground_receives_and_nothi
     ball = view.maps.mask
     z = view.maps.normals[ball][:, 2].numpy()
     sheltered = from_plane(
-        view.maps.points[ball],
-        view.maps.normals[ball],
-        lambda r: 1 - RADIUS**2 * HEIGHT / (r**2 + HEIGHT**2) ** 1.5,
+        view.maps.points[ball], view.maps.normals[ball], lambda r: 1 - RADIUS**2 * HEIGHT / (r**2 + HEIGHT**2) ** 1.5
     )
     assert np.abs(received[ball].numpy() - (1 + z) / 2 - sheltered).max() < 0.05
     assert abs(float((received[ball].numpy() - (1 + z) / 2 - sheltered).mean())) < 0.01

@@ -1,6 +1,5 @@
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import lit_table
@@ -17,8 +16,7 @@ N = 12
 
 @pytest.fixture(scope="module")
 def stack():
-    rng = np.random.default_rng(1)
-    return lit_table.stack_of(lit_table.lit_photos(N, rng, lit_table.with_object(lit_table.table(rng))))
+    return lit_table.usual(N)
 
 
 def with_photo(stack, index, rgb):
@@ -70,8 +68,7 @@ def test_shake_along_one_axis_is_found(stack, axis):
 
 @pytest.fixture(scope="module")
 def eighteen():
-    rng = np.random.default_rng(3)
-    return lit_table.stack_of(lit_table.lit_photos(18, rng, lit_table.with_object(lit_table.table(rng))))
+    return lit_table.usual(18, seed=3)
 
 
 def test_hands_in_a_third_of_the_photos_are_found(eighteen):
@@ -172,22 +169,8 @@ def test_quantiles_of_columns_are_numpys_also_with_gaps_and_without_values():
 
 
 @pytest.fixture(scope="module")
-def albedo():
-    return lit_table.table(np.random.default_rng(1))
-
-
-@pytest.fixture(scope="module")
-def board(albedo):
-    """The board where the object will stand, in even light."""
-    return a_board(lit_table.photograph(0.6 * lit_table.with_board(albedo, lit_table.TRIPOD_BOARD), of(3)))
-
-
-def of(seed):
-    return np.random.default_rng(seed)
-
-
-def a_board(rgb):
-    return replace(lit_table.stack_of([rgb]), paths=(Path("board/IMG_0.jpg"),))
+def board():
+    return lit_table.usual_board()
 
 
 def pushed_from(stack, first, u=4.0, v=-3.0):
@@ -211,9 +194,10 @@ def test_the_larger_group_counts_where_the_board_belongs_to_it_or_tells_nothing(
     pushed = pushed_from(stack, 8)
     later = [(f"IMG_{k}.jpg", "camera moved", True) for k in range(8, N)]
     assert names(check_stack(pushed, board=board)) == later
-    other = a_board(lit_table.photograph(0.6 * lit_table.table(of(7)), of(8)))
+    bare = lit_table.table(np.random.default_rng(7))
+    other = replace(board, rgb=lit_table.photograph(0.6 * bare, np.random.default_rng(8))[None])
     assert names(check_stack(pushed, board=other)) == later
-    after = a_board(lit_table.moved(board.rgb[0], 4, -3))
+    after = replace(board, rgb=lit_table.moved(board.rgb[0], 4, -3)[None])
     assert names(check_stack(pushed, board=after)) == [(f"IMG_{k}.jpg", BOARD_OFF, True) for k in range(8)]
 
 

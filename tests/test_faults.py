@@ -157,39 +157,34 @@ def test_sigterm_saves_the_last_rest_and_leaves_within_five_seconds(tmp_path):
 
 
 LOCKS = """
-import os, sys, time
+import sys
+from multiprocessing import get_context
 from pathlib import Path
 from capture.errors import UserError
 from reconstruct.run_folder.lock import take_lock
 
-folder, n = Path(sys.argv[1]), 4
+def take(place, ready, tried, taken):
+    ready.wait()
+    try:
+        take_lock(place)
+        taken.put(1)
+    except UserError:
+        pass
+    tried.wait()  # who has the folder lives until all have tried
+
+context, n = get_context("fork"), 4
 for turn in range(15):
-    place = folder / str(turn)
+    place = Path(sys.argv[1]) / str(turn)
     place.mkdir()
     (place / "lock").write_text('{"pid": 1, "started": 0}')
-    (tried, has_tried), (over, is_over) = os.pipe(), os.pipe()
-    begin = time.monotonic() + 0.03
-    children = []
-    for _ in range(n):
-        pid = os.fork()
-        if pid == 0:
-            os.close(is_over)
-            while time.monotonic() < begin:
-                pass
-            code = 0
-            try:
-                take_lock(place)
-            except UserError:
-                code = 1
-            os.write(has_tried, b".")
-            os.read(over, 1)  # who has the folder lives until all have tried
-            os._exit(code)
-        children.append(pid)
-    for _ in range(n):
-        os.read(tried, 1)
-    os.close(is_over)
-    codes = [os.WEXITSTATUS(os.waitpid(pid, 0)[1]) for pid in children]
-    assert codes.count(0) == 1, codes
+    ready, tried, taken = context.Barrier(n), context.Barrier(n), context.SimpleQueue()
+    processes = [context.Process(target=take, args=(place, ready, tried, taken)) for _ in range(n)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    taken.get()
+    assert taken.empty()
 """
 
 

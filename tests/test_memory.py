@@ -11,12 +11,11 @@ from synthetic import BALL, Look, render
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import load_calibration
 from calibration.known_scene import KnownScene
-from capture.files.schema import read_kept
-from reconstruct.run import pipeline
+from reconstruct.run import solve_stage
 from reconstruct.run_folder import forecast
 from reconstruct.run_folder.folder import PLAN, RunFolder
 from reconstruct.run_folder.forecast import memory_room
-from reconstruct.source.photos import MARGIN, OVERRIDE, Plan, plan_for, predicted_memory
+from reconstruct.source.photos import MARGIN, OVERRIDE, plan_for, predicted_memory
 from reconstruct.source.source import RunOptions, Source
 
 # photos, their size, preset, bytes of private memory at the peak: runs of benchmarks/soak/large.py and of examples/spot
@@ -76,16 +75,14 @@ def test_a_run_keeps_to_its_decision_and_writes_which_photos_it_left_out(tmp_pat
     source = Source(tmp_path, known=KnownScene(calibration, (tmp_path / "a.png",) * 50, None, None))
     with RunFolder(tmp_path / "out") as run:
         for memory in (0.3, None):  # the second invocation finds more room, and goes on as before
-            options = RunOptions(preset="draft", memory=memory)
-            kept = pipeline._within_memory(source, options, run, CalibratedViews.of(calibration))
+            plan = solve_stage.kept_plan(source, RunOptions(preset="draft", memory=memory), run)
+            kept = solve_stage._within_memory(source, plan, run, CalibratedViews.of(calibration))
             thinned = kept.first
             assert sum(light.used for light in thinned.lights) == 40
             assert load_calibration(run.file("calibration.json")) == thinned
-        plan = read_kept(run.file(PLAN), Plan)
-        assert plan and OVERRIDE in plan.sentence and "40 of 50 photos" in plan.sentence
+            assert plan and OVERRIDE in plan.sentence and "40 of 50 photos" in plan.sentence
         run.discard(PLAN)
-        options = RunOptions(preset="draft", memory=64.0)
-        assert all(light.used for light in pipeline._within_memory(source, options, run, kept).first.lights)
+        plan = solve_stage.kept_plan(source, RunOptions(preset="draft", memory=64.0), run)
+        assert plan and OVERRIDE not in plan.sentence
+        assert all(light.used for light in solve_stage._within_memory(source, plan, run, kept).first.lights)
         assert all(light.used for light in load_calibration(run.file("calibration.json")).lights)
-        plan = read_kept(run.file(PLAN), Plan)
-        assert plan is None or OVERRIDE not in plan.sentence

@@ -50,8 +50,7 @@ def off(found: np.ndarray, turn: tuple[float, float, float]) -> float:
 
 @pytest.fixture(scope="module")
 def stack() -> PhotoStack:
-    rng = np.random.default_rng(1)
-    return lit_table.stack_of(lit_table.lit_photos(N, rng, lit_table.with_object(lit_table.table(rng))))
+    return lit_table.usual(N)
 
 
 def test_photos_after_a_tap_are_moved_back_pan_tilt_and_roll(stack):
@@ -130,16 +129,12 @@ def plane(camera: PosedCamera) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def eight() -> PhotoStack:
-    rng = np.random.default_rng(1)
-    return lit_table.stack_of(lit_table.lit_photos(EIGHT, rng, lit_table.with_object(lit_table.table(rng))))
+    return lit_table.usual(EIGHT)
 
 
 @pytest.fixture(scope="module")
 def board() -> PhotoStack:
-    """The board where the object will stand, in even light, of the same table."""
-    bare = lit_table.table(np.random.default_rng(1))
-    rgb = lit_table.photograph(0.6 * lit_table.with_board(bare, lit_table.TRIPOD_BOARD), np.random.default_rng(3))
-    return replace(lit_table.stack_of([rgb]), paths=(Path("board/IMG_0.jpg"),))
+    return lit_table.usual_board()
 
 
 def moved(stack: PhotoStack, homography: np.ndarray) -> PhotoStack:

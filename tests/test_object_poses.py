@@ -18,7 +18,7 @@ from reconstruct.labels.supervision import placed_rays, supervise
 from reconstruct.object_poses import alignment
 from reconstruct.object_poses import confirmed as confirmation
 from reconstruct.object_poses.alignment import Alignment, SeenSurface, align, angle_between, mean_difference, stepped
-from reconstruct.object_poses.confirmed import Met, confirmed, how_met, withheld
+from reconstruct.object_poses.confirmed import confirmed, how_met, withheld
 from reconstruct.object_poses.light_motions import MODES, LightMotions, unseen_motion
 from reconstruct.object_poses.motion_refine import MotionTrial, ObjectPoseRays, compare, refined_motion
 from reconstruct.object_poses.together import PlacedObjectPose, SolvedObjectPose, Together, lay_together, merged_surface
@@ -34,6 +34,7 @@ SHAPES = (
 )
 TURN = (Rotation.from_euler("z", 70, degrees=True) * Rotation.from_euler("x", 115, degrees=True)).as_matrix()
 STILL = Pose(np.eye(3), np.zeros(3))
+FRONT = np.array([0.0, -0.6, 0.8])  # the side of which the cameras are
 
 
 def lying() -> tuple[tuple[Sphere, ...], Pose]:
@@ -95,7 +96,7 @@ def own_rays(laid):
 def test_how_an_object_was_turned_is_found_from_the_halves_that_either_object_pose_saw(monkeypatch):
     fewer(monkeypatch)
     shapes, motion = lying()
-    found = align(seen_from(SHAPES, np.array([0.0, -0.6, 0.8])), seen_from(shapes, np.array([0.0, -0.6, 0.8])))
+    found = align(seen_from(SHAPES, FRONT), seen_from(shapes, FRONT))
     degrees, length = off(found.motion, motion)
     assert degrees < 0.5 and length < 0.3
     assert not found.by_colour
@@ -109,8 +110,7 @@ def test_look_alikes_are_told_apart_by_colour_or_refused(monkeypatch, is_coloure
     rest = [Sphere((0.0, 30.0, 20.0), 20.0, COLOUR), Sphere((26.0, -15.0, 20.0), 20.0, second)]
     top = Sphere((0.0, 0.0, 38.0), 14.0, COLOUR)
     triangle = (*rest, Sphere((-26.0, -15.0, 20.0), 20.0, third), top)  # the same when turned by a third
-    side = np.array([0.0, -0.6, 0.8])
-    first = seen_from(triangle, side)
+    first = seen_from(triangle, FRONT)
     turned = replace(seen_from(triangle, np.array([0.3, -0.5, 0.8]), seed=1), name="turned_1")
     if is_coloured:
         found = align(first, turned)
@@ -247,12 +247,7 @@ def test_a_solved_scene_of_two_object_poses_equals_its_file_and_knows_both_world
 
 def test_merged_surfaces_are_cut_at_every_table():
     shapes, motion = lying()
-    merged = merged_surface(
-        [
-            (seen_from(SHAPES, np.array([0.0, -0.6, 0.8])), STILL),
-            (seen_from(shapes, np.array([0.0, -0.6, 0.8])), motion),
-        ]
-    )
+    merged = merged_surface([(seen_from(SHAPES, FRONT), STILL), (seen_from(shapes, FRONT), motion)])
     inside = torch.nonzero(merged.values < 0).double().numpy() * merged.spacing + merged.origin.double().numpy()
     assert inside[:, 2].min() >= 0 and motion.inverse().apply(inside)[:, 2].min() >= 0
 
@@ -309,11 +304,6 @@ def test_pixels_that_are_withheld_are_missing_in_the_scene_and_the_same_in_each_
     assert torch.equal(once.usable, again.usable)
     missing = float((before.usable & ~once.usable).float().mean())
     assert 0.15 < missing < 0.35
-
-
-def test_an_error_is_worse_only_beyond_its_noise():
-    assert Met("a", 0.01, 0.03, noise=0.005).is_worse(1.5)
-    assert not Met("a", 0.01, 0.03, noise=0.015).is_worse(1.5)
 
 
 def test_a_surface_of_all_meets_the_rays_of_each_object_pose_unless_a_motion_is_off(object_poses):

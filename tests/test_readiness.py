@@ -39,13 +39,10 @@ def cover(rendered):
     return shadow_cover(rendered[0])
 
 
-def some_used(truth, keep):
-    """The calibration with only those lights used for which keep(azimuth) holds."""
-    lights = []
-    for light in truth.calibration.lights:
-        azimuth = np.arctan2(light.position[1], light.position[0])
-        used = bool(keep(azimuth))
-        lights.append(replace(light, used=used, reason="" if used else "left out"))
+def with_used(truth, keep):
+    """The calibration with only those lights used for which keep(place, azimuth) holds."""
+    azimuths = [np.arctan2(light.position[1], light.position[0]) for light in truth.calibration.lights]
+    lights = [replace(light, used=bool(keep(k, azimuths[k]))) for k, light in enumerate(truth.calibration.lights)]
     return replace(truth.calibration, lights=tuple(lights))
 
 
@@ -71,8 +68,8 @@ def test_a_side_without_light_is_named_as_seen_by_the_camera(truth, cover):
     assert side_in_words(to_camera + np.pi, truth.calibration, np.zeros(3)) == "from behind the object"
     assert side_in_words(np.arctan2(right[1], right[0]), truth.calibration, np.zeros(3)) == "from the right"
     camera = truth.calibration.posed_camera
-    seen_right = some_used(
-        truth, lambda azimuth: abs(from_the_camera(azimuth, camera, np.zeros(3)) - np.pi / 2) < np.pi / 2
+    seen_right = with_used(
+        truth, lambda _, azimuth: abs(from_the_camera(azimuth, camera, np.zeros(3)) - np.pi / 2) < np.pi / 2
     )
     found = judge(seen_right, (), cover)
     assert found.grade in ("fair", "poor")
@@ -80,14 +77,8 @@ def test_a_side_without_light_is_named_as_seen_by_the_camera(truth, cover):
 
 
 def test_too_few_photos_are_poor_and_three_are_hopeless(truth, cover):
-    names = [light.photo for light in truth.calibration.lights]
-
-    def first(n):
-        lights = tuple(replace(x, used=x.photo in names[:n]) for x in truth.calibration.lights)
-        return replace(truth.calibration, lights=lights)
-
-    assert judge(first(8), (), cover).grade == "poor"
-    found = judge(first(3), (), cover)
+    assert judge(with_used(truth, lambda k, _: k < 8), (), cover).grade == "poor"
+    found = judge(with_used(truth, lambda k, _: k < 3), (), cover)
     assert found.grade == "hopeless"
     with pytest.raises(ReconstructionError, match=r"3 of 26 photos can be used, 4 are needed at least\. Take more"):
         refuse_hopeless(found)
@@ -111,8 +102,7 @@ def test_the_larger_group_has_the_right_exposure_wherever_it_stands(truth):
 def test_a_tripod_that_moved_is_a_reason_and_the_advice_is_to_photograph_the_board_again(truth, cover):
     names = [light.photo for light in truth.calibration.lights]
     left_out = [Finding(Path(name), BOARD_OFF, "", 9.4, 0.6, True) for name in names[7:]]
-    lights = tuple(replace(x, used=x.photo in names[:7]) for x in truth.calibration.lights)
-    found = judge(replace(truth.calibration, lights=lights), left_out, cover)
+    found = judge(with_used(truth, lambda k, _: k < 7), left_out, cover)
     moved = (
         f"the tripod moved: 19 photos, {names[7]} to {names[-1]}, lie up to 9 px off the photo of the board "
         "(at most 0.6 px is fine) and are left out, 7 photos with the board's view are used"
@@ -142,26 +132,19 @@ def test_lights_of_large_uncertainty_decide_the_grade_and_are_named_first(truth,
 def test_doubts_and_dropped_photos_are_reasons(truth, cover):
     names = [light.photo for light in truth.calibration.lights]
     findings = [Finding(Path(name), "blurred", "shaken", 0.4, 0.8, True) for name in names[:9]]
-    lights = tuple(replace(x, used=x.photo not in names[:9]) for x in truth.calibration.lights)
-    found = judge(replace(truth.calibration, lights=lights), findings, cover, ("the tone curve is doubtful",))
+    found = judge(with_used(truth, lambda k, _: k >= 9), findings, cover, ("the tone curve is doubtful",))
     assert "17 of 26 photos can be used (blurred: 9)" in found.reasons
     assert "the tone curve is doubtful" in found.reasons
 
 
 def test_the_page_and_the_terminal_say_it_all(truth, cover, tmp_path):
-    half = some_used(truth, lambda azimuth: azimuth > 0)
+    half = with_used(truth, lambda _, azimuth: azimuth > 0)
     finding = Finding(Path(half.lights[0].photo), "over-exposed", "7% of the pixels <are> saturated", 0.07, 0.05, False)
     checked = CaptureCheck("heap & co", judge(half, (finding,), cover), half, (finding,), cover, ("a note",))
     page = write_check(checked, tmp_path).read_text()
     assert [path.name for path in tmp_path.iterdir()] == [PAGE]
-    for words in (
-        "heap &amp; co",
-        "What to shoot next",
-        "&lt;are&gt; saturated",
-        "a note",
-        "not used",
-        *checked.readiness.advice,
-    ):
+    told = ("heap &amp; co", "What to shoot next", "&lt;are&gt; saturated", "a note", "not used")
+    for words in (*told, *checked.readiness.advice):
         assert words.replace("'", "&#x27;") in page
     assert page.count("<circle") >= len(half.lights) and "http" not in page.replace("http-equiv", "")
     lines = check_lines(checked)
@@ -171,8 +154,7 @@ def test_the_page_and_the_terminal_say_it_all(truth, cover, tmp_path):
 
 @pytest.mark.parametrize("n_used", [26, 2])
 def test_the_command_leaves_page_and_json_and_refuses_the_hopeless(truth, cover, tmp_path, monkeypatch, capsys, n_used):
-    lights = tuple(replace(x, used=i < n_used) for i, x in enumerate(truth.calibration.lights))
-    calibration = replace(truth.calibration, lights=lights)
+    calibration = with_used(truth, lambda k, _: k < n_used)
     checked = CaptureCheck("heap", judge(calibration, (), cover), calibration, (), cover)
     monkeypatch.setattr(calibration_source, "open_source", lambda folder, options: Source(folder))
     monkeypatch.setattr(Source, "photos", lambda self: truth.stack.paths)

@@ -1,30 +1,19 @@
 """A file that is not taken is said once, in words that say what to do, and the sentence can be dismissed."""
 
-import io
 import sys
-import zipfile
 
 import pytest
 from studio_client import served
-from test_intake import jpeg
+from test_intake import jpeg, zipped
 from test_studio import capture_in
 from test_studio_browser import PHONE, opened
 from waiting import wait_until
 
-
-def a_zip(**files: bytes) -> bytes:
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as archive:
-        for name, content in files.items():
-            archive.writestr(name.replace("_", "."), content)
-    return file.getvalue()
-
-
 REFUSED = {  # name, content, role
     "text under a photo's name": ("IMG_7.jpg", b"no photo", ""),
     "an empty photo's name": ("set/photos/IMG_8.png", b"<html>", ""),
-    "an archive of texts": ("set.zip", a_zip(notes_txt=b"x", more_md=b"y"), ""),
-    "an archive with a photo that is none": ("two.zip", a_zip(IMG_jpg=b"x" * 99), ""),
+    "an archive of texts": ("set.zip", zipped({"notes.txt": b"x", "more.md": b"y"}), ""),
+    "an archive with a photo that is none": ("two.zip", zipped({"IMG.jpg": b"x" * 99}), ""),
     "no archive": ("three.zip", b"PK nothing", ""),
     "a role where the settings are damaged": ("IMG_9.jpg", jpeg(9), "board"),
 }

@@ -105,6 +105,7 @@ def test_an_empty_folder_gets_a_report_and_a_run_that_stopped_early_says_where_w
     assert "There is no mesh" in Reader(page_of(tmp_path)).text
     fake_run.start_run(tmp_path, truth)
     assert "There is no mesh. Stopped while fitting the surface." in Reader(page_of(tmp_path)).text
+    (tmp_path / "lock").unlink()
     with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path) as run:
         run.claim({}, {})
         with run.stage("calibrate"):

@@ -177,7 +177,7 @@ def test_a_stage_is_done_once_and_again_only_when_its_result_was_removed(tmp_pat
 
 def test_steps_that_a_package_logs_are_said_while_they_last_and_by_their_own_thread_alone():
     logger, said, warned = logging.getLogger("calibration.flashlight.some"), [], []
-    with log_to("calibration", said.append, warned.append):
+    with log_to(said.append, warned.append):
         logger.info("placing lights, %d of %d", 1, 2)
         other = threading.Thread(target=logger.info, args=("of another run",))
         other.start()

@@ -252,10 +252,7 @@ def test_a_view_without_a_board_photo_is_placed_by_its_photos_under_the_flashlig
     rng = np.random.default_rng(2)
     clean = seen_from(PLACES[1]).astype(float)
     lit = [np.clip(clean + rng.normal(0, 2, clean.shape), 0, 255).astype(np.uint8) for _ in range(3)]
-    sessions = [
-        session(tmp_path, "v0", [seen_from(PLACES[0])]),
-        session(tmp_path, "v1", [], lit),
-    ]
+    sessions = [session(tmp_path, "v0", [seen_from(PLACES[0])]), session(tmp_path, "v1", [], lit)]
     fits = fit_boards(sessions, shared)
     assert off(fits[1], PLACES[1]) < 0.8
     bare = [np.full((75, 100), 90, np.uint8)] * 4

@@ -16,14 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from capture.checks.alignment import (
-    BOARD_OFF,
-    FEWEST_PHOTOS,
-    MOVED,
-    REFERENCE_PX,
-    home_view,
-    textures_of,
-)
+from capture.checks.alignment import BOARD_OFF, FEWEST_PHOTOS, MOVED, REFERENCE_PX, home_view, textures_of
 from capture.checks.ambient_light import shadow_findings
 from capture.checks.camera_motion import view_findings
 from capture.checks.framing import NOT_COMPARED, framing_findings

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 
 FREE = 2  # what a further group leaves free: its middle, and where it ends
 RARE = float(np.log(1000))  # nats: of ordinary numbers, normal to Student's t, one set in some hundreds looks like two
+NAMED = 6  # photos in a sentence, at most
 STEADY = 0.01  # log power of one flashlight: it jitters by a per cent, and a battery fades by some during a session
 
 
@@ -80,7 +81,7 @@ def usual_level(found: Float[np.ndarray, " photos"]) -> float:
     return float(middle[np.argmax(count)])
 
 
-def which_photos(names: Sequence[str], groups: Bool[np.ndarray, " photos"], most: int = 6) -> str:
+def which_photos(names: Sequence[str], groups: Bool[np.ndarray, " photos"]) -> str:
     """Say which photos a group holds: "from IMG_0108 on", "until IMG_0107", or their names."""
     inside = np.flatnonzero(groups)
     first, last = int(inside[0]), int(inside[-1])
@@ -88,6 +89,6 @@ def which_photos(names: Sequence[str], groups: Bool[np.ndarray, " photos"], most
         return f"from {names[first]} on"
     if len(inside) > 1 and len(inside) == last - first + 1 and first == 0:
         return f"until {names[last]}"
-    shown = ", ".join(names[k] for k in inside[:most])
-    more = f" and {len(inside) - most} more" if len(inside) > most else ""
+    shown = ", ".join(names[k] for k in inside[:NAMED])
+    more = f" and {len(inside) - NAMED} more" if len(inside) > NAMED else ""
     return f"in {shown}{more}"

@@ -19,7 +19,6 @@ from capture.checks.robust import spread
 from capture.photos.channels import in_blocks, mean_of_channels
 
 Shift = Float[np.ndarray, "2"]  # px of the stack, u and v; what the photo shows lies so far off
-Angles = Float[np.ndarray, "3"]  # of a rotation of the camera: its rotation vector, rad
 Homography = Float[np.ndarray, "3 3"]  # of pixels (u, v, 1) of the stack
 Motion = Callable[[Float[np.ndarray, " numbers"]], Homography]  # of the picture, from the others to a moved photo
 BLACK = 0.004  # added to brightness before the logarithm: about one step of 8-bit sRGB

@@ -169,19 +169,17 @@ def _read_exr(data: bytes, name: str) -> Float[np.ndarray, "rows columns 3"]:
         path = Path(folder) / "panorama.exr"  # OpenEXR reads files only; the visitor's own name never reaches the disk
         path.write_bytes(data)
         try:
-            _check_exr(exr_header(path), name)
+            header = exr_header(path)
+            if header.parts != 1:
+                said = f"{header.parts} pictures in one file, one was needed; save the map on its own."
+                raise CaptureError(f"{name}: {said}")
+            _check_size(header.width, header.height, name)
+            if len(header.names) > MOST_CHANNELS:
+                said = f"{len(header.names)} channels, at most {MOST_CHANNELS} are read; save it as RGB."
+                raise CaptureError(f"{name}: {said}")
             channels = read_exr(path)
         except BrokenFile as error:
             raise CaptureError(f"{name}: not a readable OpenEXR file ({error.reason}); copy it again.") from error
     if (picture := colour_channels(channels)) is None:
         raise CaptureError(f"{name}: channels {', '.join(sorted(channels))}; R, G and B (or Y) were needed.")
     return picture
-
-
-def _check_exr(header: ExrHeader, name: str) -> None:
-    """Check the header before the pixels are read: more than one part, too many channels or pixels are refused."""
-    if header.parts != 1:
-        raise CaptureError(f"{name}: {header.parts} pictures in one file, one was needed; save the map on its own.")
-    _check_size(header.width, header.height, name)
-    if len(header.names) > MOST_CHANNELS:
-        raise CaptureError(f"{name}: {len(header.names)} channels, at most {MOST_CHANNELS} are read; save it as RGB.")

@@ -48,8 +48,11 @@ def is_photo_name(path: Path) -> bool:
     return path.suffix.lower() in _SUFFIXES | _RAW_SUFFIXES and is_shown(path)
 
 
-def format_of(path: Path) -> str:
+def format_of(path: Path, suffix: str | None = None) -> str:
     """Return jpeg, png, tiff, heif, avif, exr or raw, by the file's first bytes; "clip" for the path of a clip's frame.
+
+    Args:
+        suffix: of the name that the file will have, where it has another one now.
 
     Raises:
         CaptureError: the file cannot be read, or has another format.
@@ -63,21 +66,22 @@ def format_of(path: Path) -> str:
             start = file.read(32)
     except OSError as error:
         raise CaptureError(f"{path} cannot be read ({error.strerror}). Check the file and its permissions.") from error
-    kind = _format_of_start(start, path)
+    is_named_raw = (path.suffix if suffix is None else suffix).lower() in _RAW_SUFFIXES
+    kind = _format_of_start(start, path, is_named_raw)
     if kind is None:
         raise _unknown(path, "no photo that can be read" if start else "nothing")
-    if path.suffix.lower() in _RAW_SUFFIXES and kind != "raw":
+    if is_named_raw and kind != "raw":
         raise _unknown(path, f"{kind.upper()} data under the name of a RAW file")
     return kind
 
 
-def _format_of_start(start: bytes, path: Path) -> str | None:
+def _format_of_start(start: bytes, path: Path, is_named_raw: bool = False) -> str | None:
     if start.startswith(b"\xff\xd8\xff"):
         return "jpeg"
     if start.startswith(b"\x89PNG\r\n\x1a\n"):
         return "png"
     if start.startswith((b"II*\0", b"MM\0*")):
-        is_tiff = path.suffix.lower() not in _RAW_SUFFIXES and _DNG_VERSION not in read_exif(path)
+        is_tiff = not is_named_raw and _DNG_VERSION not in read_exif(path)
         return "tiff" if is_tiff else "raw"
     if start.startswith(_RAW_STARTS):
         return "raw"

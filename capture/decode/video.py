@@ -99,8 +99,7 @@ def read_frame(path: Path, time_s: float) -> UInt8[np.ndarray, "height width 3"]
         found = _frame(clip, answer)
     if found is None:
         raise CaptureError(
-            f"{path} has no frame at {time_s:.3f} s that can be decoded. Was the clip replaced?",
-            Remedy.OTHER_FOLDER,
+            f"{path} has no frame at {time_s:.3f} s that can be decoded. Was the clip replaced?", Remedy.OTHER_FOLDER
         )
     return cv2.cvtColor(found[1], cv2.COLOR_BGR2RGB)
 

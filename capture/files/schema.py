@@ -76,13 +76,13 @@ def _shown(value: Any) -> str:
     return shown if len(shown) <= LONGEST_SHOWN else shown[: LONGEST_SHOWN - 3] + "..."
 
 
-def check_numbers(value: Any, file: str, advice: str = CORRECT, name: str = "") -> None:
+def check_numbers(value: Any, file: str, advice: str = CORRECT) -> None:
     """Check that every number in a value, at any depth, is one that a float can hold.
 
     Raises:
         CalibrationError: one is not; names its place.
     """
-    left = [(name, value)]
+    left = [("", value)]
     while left:
         place, one = left.pop()
         if isinstance(one, dict):

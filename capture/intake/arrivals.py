@@ -138,14 +138,7 @@ def settle(part: Path, target: Path) -> Path:
 
 
 def _refuse_other_content(part: Path, target: Path) -> None:
-    named = part.with_name(f"{part.name}{target.suffix}")  # the format is told with the suffix of a photo
     try:
-        os.link(part, named)
-    except OSError:  # a file system without links: whoever reads the capture finds out
-        return
-    try:
-        format_of(named)
+        format_of(part, target.suffix)
     except CaptureError as error:
-        raise CaptureError(str(error).replace(str(named), target.name)) from None
-    finally:
-        named.unlink()
+        raise CaptureError(str(error).replace(str(part), target.name)) from None

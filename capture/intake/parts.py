@@ -28,15 +28,7 @@ from capture.errors import CaptureError, UserError
 from capture.files.atomic import write_json
 from capture.files.regular import why
 from capture.files.schema import Number, read_kept
-from capture.intake.arrivals import (
-    MOST_FILES,
-    largest_size,
-    place_in,
-    refuse_full_disk,
-    refuse_size,
-    safe_name,
-    settle,
-)
+from capture.intake.arrivals import MOST_FILES, largest_size, place_in, refuse_full_disk, refuse_size, safe_name, settle
 from capture.session.session import ROLE_FOLDERS
 from capture.session.write_settings import set_role
 
@@ -55,20 +47,15 @@ LARGEST_ARCHIVE = 16 << 30  # bytes
 _ID = re.compile(r"[0-9a-f]{32}")
 
 
-@dataclass(frozen=True)
-class Unpacked:
-    """What came out of an archive."""
-
-    arrived: tuple[str, ...]  # relative to the capture
-    remarks: tuple[str, ...]  # one sentence for each entry that was left out
-
-
-def unpack(archive: Path, capture: Path, put: Callable[[Path, str], Path]) -> Unpacked:
+def unpack(archive: Path, capture: Path, put: Callable[[Path, str], Path]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Unpack the photos of an archive into a capture.
 
     Args:
         put: called with each file that came out, in `capture`, and its name in the archive; moves it to its place, or
             raises a CaptureError.
+
+    Returns:
+        what arrived, relative to the capture, and one sentence for each entry that was left out.
 
     Raises:
         CaptureError: it is no archive, is damaged as a whole, or is made to grow without end.
@@ -90,7 +77,7 @@ def unpack(archive: Path, capture: Path, put: Callable[[Path, str], Path]) -> Un
                 remarks.append(f"{entry.filename[-80:]}: {error}")
             finally:
                 part.unlink(missing_ok=True)
-    return Unpacked(tuple(arrived), tuple(remarks[:REMARKS]))
+    return tuple(arrived), tuple(remarks[:REMARKS])
 
 
 def _opened(archive: Path) -> zipfile.ZipFile:
@@ -337,10 +324,10 @@ class Parts:
         if Path(part.name).suffix.lower() != ARCHIVE:
             place = settled(self._path(part.id), part.name)
             return replace(part, arrived=(str(place.relative_to(capture)),))
-        unpacked = unpack(self._path(part.id), capture, settled)
-        if not unpacked.arrived:
-            raise CaptureError(f"it holds no photos. {' '.join(unpacked.remarks[:3])}")
-        return replace(part, arrived=unpacked.arrived, remarks=unpacked.remarks)
+        arrived, remarks = unpack(self._path(part.id), capture, settled)
+        if not arrived:
+            raise CaptureError(f"it holds no photos. {' '.join(remarks[:3])}")
+        return replace(part, arrived=arrived, remarks=remarks)
 
     def unfinished(self) -> list[Part]:
         """Return files that are whole but not in their captures: the server was killed between, or had no room."""

@@ -27,7 +27,6 @@ from capture.session.roles import DARK, EVEN, SAME_VIEW, PhotoFeatures, agreemen
 from capture.session.seen import SeenPhotos
 from capture.session.session import (
     FEWEST_LIT,
-    MOST_SIDE,
     ROLE_FOLDERS,
     Session,
     SessionSettings,
@@ -37,6 +36,7 @@ from capture.session.session import (
     load_settings,
     phone_back,
     photos_in,
+    with_side,
 )
 
 VIEWS, TURNED = "view_", "turned_"  # beginnings of folder names
@@ -155,17 +155,9 @@ def _with_board(session: Session, shared: Sequence[Path], seen: SeenPhotos) -> S
 
 def _with_side(sessions: Sequence[Session], side: Sequence[Path]) -> tuple[Session, ...]:
     """Return the sessions with the common photos from the side, spread evenly: each is read against one view."""
-    out = []
-    with_room_light = [session.name for session in sessions if session.board] or [session.name for session in sessions]
-    for session in sessions:
-        share = (
-            side[with_room_light.index(session.name) :: len(with_room_light)] if session.name in with_room_light else []
-        )
-        photos = (*session.side, *share)
-        more = len(photos) - MOST_SIDE
-        note = (f"{more} photos from the side were left out: {MOST_SIDE} per view are used",) if more > 0 else ()
-        out.append(replace(session, side=photos[:MOST_SIDE], notes=(*session.notes, *note)))
-    return tuple(out)
+    in_room_light = [session.name for session in sessions if session.board] or [session.name for session in sessions]
+    shares = {name: side[k :: len(in_room_light)] for k, name in enumerate(in_room_light)}
+    return tuple(with_side(session, (*session.side, *shares.get(session.name, ()))) for session in sessions)
 
 
 # --- places of the tripod in one folder -----------------------------------------------------------------------------

@@ -71,9 +71,7 @@ def find_tripods(board: Sequence[PhotoFeatures], lit: Sequence[PhotoFeatures]) -
 
 
 def roles_of(
-    photos: Sequence[PhotoFeatures],
-    is_board_known: bool = False,
-    shows_board: Callable[[Path], bool] = lambda _: False,
+    photos: Sequence[PhotoFeatures], is_board_known: bool = False, shows_board: Callable[[Path], bool] = lambda _: False
 ) -> Roles:
     """Find the roles of the photos of one flat folder.
 

@@ -18,16 +18,7 @@ from capture.files.regular import why
 from capture.files.schema import Number, Positive, Text, Vector, as_type
 from capture.photos.finding import Finding, grouped
 from capture.session.clip import choose_board_frames, choose_frames
-from capture.session.declared_objects import (
-    MOST_LIGHTS,
-    Cube,
-    Height,
-    Peg,
-    PhoneBack,
-    Solid,
-    Thickness,
-    parse_height,
-)
+from capture.session.declared_objects import MOST_LIGHTS, Cube, Height, Peg, PhoneBack, Solid, Thickness, parse_height
 from capture.session.roles import NoBoardError, Roles
 from capture.session.seen import SeenPhotos
 from capture.session.sorting import (
@@ -137,10 +128,15 @@ def load_session(folder: Path, common: SessionSettings | None = None, seen: Seen
     mask = folder / MASK
     given = mask if mask.is_file() else None
     photos = (roles.board, roles.lit, roles.light, roles.dark)
-    if len(roles.side) > MOST_SIDE:
-        notes += (f"{len(roles.side) - MOST_SIDE} photos from the side were left out: the first {MOST_SIDE} are used",)
-    more = {"side": roles.side[:MOST_SIDE], "left_out": left_out}
-    return Session(folder, *photos, settings, notes, given, phone_back(folder), **more)
+    session = Session(folder, *photos, settings, notes, given, phone_back(folder), left_out=left_out)
+    return with_side(session, roles.side)
+
+
+def with_side(session: Session, photos: tuple[Path, ...]) -> Session:
+    """Return a view with the first MOST_SIDE of these photos from the side."""
+    more = len(photos) - MOST_SIDE
+    note = (f"{more} photos from the side were left out: the first {MOST_SIDE} are used",) if more > 0 else ()
+    return replace(session, side=photos[:MOST_SIDE], notes=(*session.notes, *note))
 
 
 def load_settings(folder: Path) -> SessionSettings:

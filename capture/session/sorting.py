@@ -233,12 +233,7 @@ def _size(path: Path) -> tuple[int, int]:
 
 def photos_of(capture: Path) -> list[Path]:
     """Return the photos of a capture, folder by folder, in the natural order of their names; no mask."""
-    found: list[Path] = []
-    for place in (capture, *(capture / name for name in ROLE_FOLDERS.values())):
-        if place.is_dir():
-            mine = [path for path in place.iterdir() if is_photo_name(path) and path.name != MASK and path.is_file()]
-            found += sorted(mine, key=natural_order)
-    return found
+    return [path for path in _files_of(capture) if is_photo_name(path) and path.name != MASK]
 
 
 def folder_role(photo: Path, capture: Path) -> str:
@@ -248,14 +243,18 @@ def folder_role(photo: Path, capture: Path) -> str:
 
 def clips_of(capture: Path) -> list[Path]:
     """Return the clips of a capture."""
-    places = [place for place in (capture, capture / ROLE_FOLDERS["lit"]) if place.is_dir()]
-    return [path for place in places for path in sorted(place.iterdir()) if is_clip_name(path) and path.is_file()]
+    places = (capture, capture / ROLE_FOLDERS["lit"])
+    return [path for path in _files_of(capture) if is_clip_name(path) and path.parent in places]
+
+
+def _files_of(capture: Path) -> list[Path]:
+    places = (place for place in (capture, *(capture / name for name in ROLE_FOLDERS.values())) if place.is_dir())
+    return [path for place in places for path in sorted(place.iterdir(), key=natural_order) if path.is_file()]
 
 
 def skipped_pictures(folder: Path) -> str:
     """Return a sentence on the pictures that are not read in a capture's folders; or ""."""
-    places = [place for place in (folder, *(folder / name for name in ROLE_FOLDERS.values())) if place.is_dir()]
-    found = [path for place in places for path in sorted(place.iterdir()) if _is_skipped(path) and path.is_file()]
+    found = [path for path in _files_of(folder) if _is_skipped(path)]
     if not found:
         return ""
     first = _as_text(found[0]).name + (f" and {len(found) - 1} more" if len(found) > 1 else "")

@@ -294,15 +294,9 @@ def next_words(lights: tuple[SeenLight, ...], missing: tuple[int, ...]) -> str:
 
 
 def _middle_of_widest(missing: tuple[int, ...]) -> int:
-    """Return the sector in the middle of the longest run of missing ones."""
-    count = len(SIDES)
-    if len(missing) == count:
+    """Return the sector in the middle of the longest run of missing ones; 0 where all are."""
+    there = np.setdiff1d(np.arange(len(SIDES)), missing)
+    if not len(there):
         return 0
-    best, longest = missing[0], 0
-    for start in missing:
-        length = 1
-        while (start + length) % count in missing and length < count:
-            length += 1
-        if (start - 1) % count not in missing and length > longest:
-            best, longest = (start + length // 2) % count, length
-    return best
+    gaps = np.diff(there, append=there[0] + len(SIDES))
+    return int(there[gaps.argmax()] + (gaps.max() + 1) // 2) % len(SIDES)

@@ -1,6 +1,7 @@
 """Coverage of the lights' directions and of the shadows on the ground: do the photos show all sides of the object?"""
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import torch
@@ -38,15 +39,10 @@ def close_pairs(views: CalibratedViews, foot: Float[np.ndarray, "3"]) -> tuple[t
     Args:
         foot: where the object stands on the ground, world.
     """
-    ways = [view.calibration.world_from_camera.translation - foot for view in views.views]
-    ways = [way / np.linalg.norm(way) for way in ways]
-    found = []
-    for i, one in enumerate(ways):
-        for j in range(i + 1, len(ways)):
-            angle = float(np.arccos(np.clip(one @ ways[j], -1, 1)))
-            if angle < LEAST_APART:
-                found.append((views.views[i].name, views.views[j].name, angle))
-    return tuple(found)
+    ways = [(view.name, view.calibration.world_from_camera.translation - foot) for view in views.views]
+    ways = [(name, way / np.linalg.norm(way)) for name, way in ways]
+    found = ((a, b, float(np.arccos(np.clip(one @ other, -1, 1)))) for (a, one), (b, other) in combinations(ways, 2))
+    return tuple(pair for pair in found if pair[2] < LEAST_APART)
 
 
 def directions(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "lights 3"]:

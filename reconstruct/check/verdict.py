@@ -232,7 +232,7 @@ def read_and_check(source: Source, options: RunOptions) -> CaptureCheck:
     Raises:
         CaptureError, CalibrationError: no photos, or the board, the ground or the lights cannot be found.
     """
-    photos = [replace(one, plan=None) for one in read_photos(source, options)]  # the capture is judged, not the memory
+    photos = read_photos(source, options)
     if all(one.error is None and one.stack is None for one in photos):
         raise CaptureError(
             f"{source.folder} holds shadow pictures only, and `check` looks at photos. Run it as it is: "

@@ -201,9 +201,9 @@ class _Pairs:
         """Return each point's robust error in [0, 1]."""
         return 1 - cauchy((self.distances(motion) / width) ** 2)
 
-    def fitted(self, motion: Pose, width: float, steps: int) -> Pose:
-        """Return the motion after steps of reweighted least squares on the distances."""
-        for _ in range(steps):
+    def fitted(self, motion: Pose, width: float) -> Pose:
+        """Return the motion after STEPS of reweighted least squares on the distances."""
+        for _ in range(STEPS):
             phi, rows = self.signed(motion)
             weight = geman_mcclure((phi / width) ** 2)
             normal = (rows * weight[:, None]).T @ rows
@@ -264,9 +264,9 @@ def _coarse(first: SeenSurface, turned: SeenSurface, seed: int) -> list[Pose]:
 def _refined(first: SeenSurface, turned: SeenSurface, starts: list[Pose], seed: int) -> list[Pose]:
     """Return the distinct motions that the starts end in, the best first."""
     few, some = _Pairs(first, turned, FEW_POINTS, seed), _Pairs(first, turned, SOME_POINTS, seed)
-    ends = [few.fitted(pose, COARSE * few.size, STEPS) for pose in starts]
-    ends = [some.fitted(pose, ROUGH * some.size, STEPS) for pose in ends]
-    ends = [some.fitted(pose, 2 * CLOSE * some.voxel, STEPS) for pose in ends]
+    ends = [few.fitted(pose, COARSE * few.size) for pose in starts]
+    ends = [some.fitted(pose, ROUGH * some.size) for pose in ends]
+    ends = [some.fitted(pose, 2 * CLOSE * some.voxel) for pose in ends]
     width, centre = 2 * CLOSE * some.voxel, turned.centre()
     scores = [float(some.losses(pose, width).mean()) for pose in ends]
     distinct: list[Pose] = []
@@ -300,7 +300,7 @@ def _closely(pairs: _Pairs, motion: Pose) -> tuple[Pose, float]:
     Raises:
         ReconstructionError: the surfaces are too far apart to be the same object's.
     """
-    motion = pairs.fitted(motion, CLOSE * pairs.voxel, STEPS)
+    motion = pairs.fitted(motion, CLOSE * pairs.voxel)
     distance, most = float(np.median(pairs.distances(motion))), FITS * pairs.voxel
     if distance > most:
         raise ReconstructionError(

@@ -183,12 +183,7 @@ class _Sample:
         return np.concatenate([shades, self.weight * (1 - open_sight.numpy() - self.mask)])
 
     def light_slopes(
-        self,
-        surface: SdfGrid,
-        motion: Pose,
-        sharpness: float,
-        lights: LightMotions,
-        nudges: Float[np.ndarray, "6"],
+        self, surface: SdfGrid, motion: Pose, sharpness: float, lights: LightMotions, nudges: Float[np.ndarray, "6"]
     ) -> Float[np.ndarray, "n 6"]:
         """Return the change of the residuals as each joint motion of the lights grows by its nudge."""
         columns = []

@@ -25,10 +25,10 @@ from capture.decode.formats import is_photo_name
 from capture.errors import FOR_STUDIO, CaptureError, Remedy, UserError
 from capture.files.atomic import write_json
 from capture.files.names import is_clip_name, refuse_no_folder
-from capture.files.schema import FileName, Number, Text, read_as
+from capture.files.schema import FileName, Kind, Number, Text, read_as
 from capture.session.session import ROLE_FOLDERS
 from reconstruct.run_folder.lock import LOCK, lock_holder
-from reconstruct.stored_run.documents import MOST_PHOTOS, checked_report
+from reconstruct.stored_run.documents import MOST_PHOTOS
 from reconstruct.stored_run.stored_run import StoredRun
 
 BATCH, LOGS = "batch.json", "logs"
@@ -301,16 +301,21 @@ def load_outcomes(file: Path) -> dict[str, Outcome]:
     Raises:
         CaptureError: the file is damaged or of another format.
     """
-    if not file.is_file():
-        return {}
+    rows = read_record(file, _BatchFile, "batch", Remedy.OTHER_FOLDER).outcomes if file.is_file() else ()
+    return {row.name: replace(row, report=_report(file.parent / row.name)) for row in rows}
+
+
+def read_record(file: Path, kind: type[Kind], what: str, *remedies: Remedy) -> Kind:
+    """Return the record of a batch or queue.
+
+    Raises:
+        CaptureError: the file is damaged or of another format.
+    """
     try:
-        rows = read_as(file, _BatchFile, "")[0].outcomes
-        rows = [replace(row, report=checked_report(row.report, str(file))) for row in rows]
+        return read_as(file, kind, "")[0]
     except UserError as error:
-        raise CaptureError(
-            f"{file} is not the record of a batch ({str(error).rstrip(' .')}).", "move it away", Remedy.OTHER_FOLDER
-        ) from error
-    return {row.name: row for row in rows}
+        said = f"{file} is not the record of a {what} ({str(error).rstrip(' .')})."
+        raise CaptureError(said, "move it away; the runs stay", *remedies) from error
 
 
 def _is_done(task: Task, outcome: Outcome | None) -> bool:

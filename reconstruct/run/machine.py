@@ -1,5 +1,6 @@
 """Measure this machine's speed with a short loop of shadow rays, and plan from it how long each part of a run takes."""
 
+import math
 import os
 import platform
 import time
@@ -90,11 +91,10 @@ class Work(NamedTuple):
 
 def work_of(source: Source, options: RunOptions, has_detail: bool = False) -> Work:
     """Return what a run has to look at."""
-    photos = source.photos()
+    photos, megapixels = source.photos(), CLIP_MEGAPIXELS
     with suppress(UserError, OSError):  # a clip's frames have no header
-        width, height = read_size(photos[0])
-        return Work(len(photos), width * height / 1e6, LONG_SIDES[options.preset], has_detail)
-    return Work(len(photos), CLIP_MEGAPIXELS, LONG_SIDES[options.preset], has_detail)
+        megapixels = math.prod(read_size(photos[0])) / 1e6
+    return Work(len(photos), megapixels, LONG_SIDES[options.preset], has_detail)
 
 
 def planned_seconds(config: FitConfig, speed: Speed, work: Work) -> dict[str, float | dict[int, float]]:

@@ -19,7 +19,7 @@ A stage that an earlier invocation finished is not repeated: its result is read 
 import platform
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 import torch
@@ -29,7 +29,6 @@ from calibration.calibrated_views import CalibratedViews, load_views, save_views
 from calibration.posed_camera import PosedCamera
 from capture.errors import CaptureError
 from capture.files.atomic import atomic_file
-from capture.files.schema import read_kept
 from capture.files.title import hand_title_on
 from capture.photos.photo import read_thumbnail
 from reconstruct.check.readiness import refuse_hopeless
@@ -40,14 +39,14 @@ from reconstruct.run.machine import kernels_are_compiled, measure_speed, planned
 from reconstruct.run.presets import solver_config
 from reconstruct.run.report_json import summary, versions
 from reconstruct.run.results import detail_is_asked, save_results, write_detail
-from reconstruct.run.solve_stage import solve
-from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder, content_hash
+from reconstruct.run.solve_stage import kept_plan, solve
+from reconstruct.run_folder.folder import KEPT, RunFolder, content_hash
 from reconstruct.run_folder.forecast import duration_text, plan_numbers
 from reconstruct.run_folder.progress import Lazy, log_to, once
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.backend import backend_name, solver_device
 from reconstruct.source.calibrate_source import calibrate_source, in_millimetres, with_scale_of
-from reconstruct.source.photos import Photos, Plan, memory_plan, read_photos, within_plan
+from reconstruct.source.photos import Photos, read_photos
 from reconstruct.source.source import RunOptions, Source
 from reconstruct.stored_run.maps import THUMBS, thumbnail_name
 from reconstruct.stored_run.stored_run import CALIBRATION, FIELDS
@@ -75,6 +74,8 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
     if run.forgotten:
         run.progress("capture", message=f"forgotten, as the run starts anew: {', '.join(sorted(run.forgotten))}")
     _plan_time(source, options, run, stages)
+    if stages != "calibrate" and not run.is_finished("solve"):
+        kept_plan(source, options, run)  # before photos fill the memory
     photos = Lazy(lambda: _read(source, options, run))
     calibrated = Lazy(lambda: load_views(run.file(CALIBRATION)))
     fields = Lazy(lambda: load_fields(run.file(FIELDS)))
@@ -135,13 +136,9 @@ def _read(source: Source, options: RunOptions, run: RunFolder) -> tuple[Photos, 
     with run.stage("capture", f"reading {len(source.photos())} photos", leaves_files=False):
         for one in source.left_out():
             run.progress(message=f"{one.called} is left out: {one.kind}, {one.text}")
-        plan = _plan(source, options, run)
-        if plan is not None:
-            run.progress(message=plan.sentence)
-            run.activity(f"reading {len(source.photos())} photos")
         longest = 2 * options.long_side() ** 2
         has_room = shutil.disk_usage(run.path).free > KEPT_PER_PIXEL * longest * len(source.photos())
-        photos = read_photos(source, options, run.file(KEPT) if has_room else None, plan)
+        photos = read_photos(source, options, run.file(KEPT) if has_room else None)
         if not run.is_finished("calibrate"):
             write_thumbnails(source, run)
     return photos
@@ -149,7 +146,7 @@ def _read(source: Source, options: RunOptions, run: RunFolder) -> tuple[Photos, 
 
 def _calibrated(source: Source, photos: Sequence[Photos], options: RunOptions, run: RunFolder) -> CalibratedViews:
     """Stage "calibrate"; small photos are named anew if the first view is left out."""
-    with log_to("calibration", run.activity, lambda text: run.progress(message=text)):
+    with log_to(run.activity, lambda text: run.progress(message=text)):
         calibrated = calibrate_source(source, photos, options)
     if len(photos) > 1 and photos[0].view != calibrated.views[0].name:
         write_thumbnails(source, run, calibrated.views[0].name)
@@ -168,7 +165,6 @@ def _solved(
     source: Source, photos: Lazy[tuple[Photos, ...]], calibrated: CalibratedViews, options: RunOptions, run: RunFolder
 ) -> SolvedScene:
     """Stage "solve", see solve_stage; a surface that no visitor stopped gets the given scale."""
-    calibrated = _within_memory(source, options, run, calibrated)
     fields, length = solve(source, options, run, photos, calibrated), source.scale(options)
     if source.known is not None and source.known.left_out is not None and source.ground_is_known(options):
         fields = without_ball(fields, source.known.left_out, calibrated.first.posed_camera)
@@ -186,31 +182,6 @@ def _keep_scale(
         known = source.ground_is_known(options)
         scaled = [with_scale_of(view.calibration, fields, length, known) for view in calibrated.views]
         save_views(calibrated.with_calibrations(scaled), run.file(CALIBRATION))
-
-
-def _plan(source: Source, options: RunOptions, run: RunFolder) -> Plan | None:
-    """Return what fits into memory, decided once for all invocations of a run; None for a trained field."""
-    plan = read_kept(run.file(PLAN), Plan)
-    if plan is None:
-        plan = memory_plan(source, options)
-        if plan is not None:
-            run.write_json(PLAN, asdict(plan))
-    return plan
-
-
-def _within_memory(source: Source, options: RunOptions, run: RunFolder, calibrated: CalibratedViews) -> CalibratedViews:
-    """Return the calibrations with as many photos in use as the plan allows, and update calibration.json."""
-    plan = _plan(source, options, run)
-    if plan is None:
-        return calibrated
-    before, every = [view.calibration for view in calibrated.views], len(source.photos())
-    thinned = [within_plan(one, plan, every) for one in before]
-    used = [[light.used for one in some for light in one.lights] for some in (before, thinned)]
-    if used[0] == used[1]:
-        return calibrated
-    calibrated = calibrated.with_calibrations(thinned)
-    save_views(calibrated, run.file(CALIBRATION))
-    return calibrated
 
 
 def claim(source: Source, options: RunOptions, run: RunFolder, stages: str, force: bool) -> None:

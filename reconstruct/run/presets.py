@@ -14,11 +14,7 @@ FINE_NODES = 240  # along the object: about one voxel per pixel of an object tha
 BRIEF = {"draft": 1_000, "standard": 5_000, "fine": 20_000}  # iterations of a trained field
 BRIEF_WEIGHTS = Weights(eikonal=0.03, bound=1.0, contain=0.2, early_foreground=1.0)  # see training
 BRIEF_START = 150  # steps of a network onto a ball on the ground: to about 2 % of the bounding sphere's radius
-RATES = {
-    "neural": 1e-3,
-    "hash": 5e-3,
-    "grid": 2e-2,
-}  # of learning; a grid node moves only itself
+RATES = {"neural": 1e-3, "hash": 5e-3, "grid": 2e-2}  # of learning; a grid node moves only itself
 
 
 def preset(name: str, seed: int) -> tuple[int, FitConfig]:

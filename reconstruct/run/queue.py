@@ -19,8 +19,8 @@ from msgspec import Struct
 
 from capture.errors import CaptureError, UserError
 from capture.files.atomic import write_json
-from capture.files.schema import Count, Number, Text, read_as
-from reconstruct.run.batch import PROGRAM, Task, log_file, start_task, why_it_failed
+from capture.files.schema import Count, Number, Text
+from reconstruct.run.batch import PROGRAM, Task, log_file, read_record, start_task, why_it_failed
 from reconstruct.run_folder.folder import LOG, read_log
 from reconstruct.run_folder.lock import LOCK, lock_holder, running
 
@@ -236,13 +236,5 @@ def _end_of(job: Job, code: int | None) -> tuple[str, str]:
 
 
 def _load(file: Path, program: tuple[str, ...]) -> list[Job]:
-    if not file.is_file():
-        return []
-    try:
-        jobs = read_as(file, _QueueFile, "")[0].jobs
-        threads = psutil.cpu_count() or 1
-        return [replace(job, task=replace(job.task, threads=threads, program=program)) for job in jobs]
-    except UserError as error:
-        raise CaptureError(
-            f"{file} is not the record of a queue ({str(error).rstrip(' .')}). Move it away; the runs stay."
-        ) from error
+    jobs, threads = read_record(file, _QueueFile, "queue").jobs if file.is_file() else [], psutil.cpu_count() or 1
+    return [replace(job, task=replace(job.task, threads=threads, program=program)) for job in jobs]

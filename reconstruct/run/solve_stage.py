@@ -14,11 +14,12 @@ from itertools import count
 import msgspec
 import torch
 
-from calibration.calibrated_views import CalibratedViews
+from calibration.calibrated_views import CalibratedViews, save_views
 from calibration.calibration import Calibration
 from capture.errors import ReconstructionError, Remedy
 from capture.files.atomic import atomic_file, read_json
 from capture.files.regular import why
+from capture.files.schema import read_kept
 from reconstruct.config import FitConfig
 from reconstruct.fields import SolvedScene, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh, preview_mesh
@@ -27,7 +28,7 @@ from reconstruct.object_poses.confirmed import confirmed, withheld
 from reconstruct.object_poses.together import PlacedObjectPose, SolvedObjectPose, Together, lay_together
 from reconstruct.run.machine import within_budget, work_of
 from reconstruct.run.presets import continued, preset, solver_config, training
-from reconstruct.run_folder.folder import KEPT, RunFolder
+from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder
 from reconstruct.run_folder.progress import Lazy
 from reconstruct.run_folder.requests import (
     NEXT_LEVEL,
@@ -47,8 +48,9 @@ from reconstruct.solve.backend import solver_device, training_device
 from reconstruct.solve.checkpoint import SolveState, load_state, save_state
 from reconstruct.solve.level import Rescheduled
 from reconstruct.solve.solver import SolveReporter, begun, fit, fit_steered, fit_surface
-from reconstruct.source.photos import Photos, read_photos
+from reconstruct.source.photos import Photos, Plan, memory_plan, read_photos, within_plan
 from reconstruct.source.source import LONG_SIDES, RunOptions, Source
+from reconstruct.stored_run.stored_run import CALIBRATION
 from reconstruct.views import Scenes
 
 SMALL = "draft"  # preset of the poses' own solves: enough for how the object was turned
@@ -90,12 +92,6 @@ def joined_scenes(scenes: Scenes, object_poses: ObjectPoses, placed: tuple[Place
     motions = {one.name: one.motion for one in placed}
     moved = [replace(s, object_from_world=motions[name]) for name, own in object_poses if name in motions for s in own]
     return (*scenes, *moved)
-
-
-def forget_object_poses(run: RunFolder) -> None:
-    """Remove the files of the poses' own solves."""
-    for path in run.path.glob(f"{KEPT_OBJECT_POSE}_*"):
-        run.discard(path.name)
 
 
 @dataclass(frozen=True)
@@ -240,19 +236,26 @@ def seen_views(photos: Sequence[Photos], calibrated: CalibratedViews) -> tuple[t
     return tuple((by_name[view.name], view.calibration) for view in calibrated.views)
 
 
-def prepare_scene(source: Source, photos: Sequence[Photos], calibrated: CalibratedViews, options: RunOptions) -> Scenes:
+def prepare_scene(
+    source: Source, photos: Sequence[Photos], calibrated: CalibratedViews, options: RunOptions, plan: Plan | None = None
+) -> Scenes:
     """Return the photos and calibration of each calibrated view as torch tensors.
 
     They have the preset's size, or the largest that fits into memory.
 
+    Args:
+        plan: what fits, where that was decided and `calibrated` keeps to it; decided now unless given.
+
     Raises:
+        CaptureError: the first photo cannot be read.
         ReconstructionError: no photo has a usable light, the photos differ in size from the calibrated camera's, or the
             uneven ground is above the camera.
     """
-    scenes, long_side = [], LONG_SIDES[options.preset]
+    if plan is None and (plan := memory_plan(source, options)) is not None:
+        calibrated = within_plan(calibrated, plan, len(source.photos()))
+    scenes, long_side = [], LONG_SIDES[options.preset] if plan is None else plan.long_side
     for own, calibration in seen_views(photos, calibrated):
-        side = long_side if own.plan is None else min(long_side, own.plan.long_side)
-        scene = build_scene(own.stack, calibration, side, own.shadow, own.mask, own.ground_depth)
+        scene = build_scene(own.stack, calibration, long_side, own.shadow, own.mask, own.ground_depth)
         name = own.view if len(calibrated.views) > 1 or calibrated.name else ""
         scenes.append(replace(scene, ground_known=source.ground_is_known(options), view=name))
     return tuple(scenes)
@@ -274,28 +277,52 @@ def solve(
     while True:
         resolution, config = schedule(options, run, source)
         chosen = replace(options, preset=resolution)
+        plan = kept_plan(source, chosen, run)
+        calibrated = _within_memory(source, plan, run, calibrated)
         read = _photos_for(chosen, source, options, run, photos)
-        scenes = prepare_scene(source, read, calibrated, chosen)
+        scenes = prepare_scene(source, read, calibrated, chosen, plan)
         report = _reporter(run, scenes[0])
         if isinstance(config, TrainConfig):
             steering = RequestSteering(run)
             solved = train(scenes[0], config, report, checkpoint, device, steering)
         else:
-            object_poses = [(one.name, prepare_scene(source, read, one, chosen)) for one in calibrated.object_poses]
+            anew = calibrated.object_poses
+            object_poses = [(one.name, prepare_scene(source, read, one, chosen, plan)) for one in anew]
             scenes, start, doubts = joined_object_poses(scenes, tuple(object_poses), config, run, report, device)
             steering = RequestSteering(run, config, continued)
             earlier = load_state(run.file(EARLIER), json.dumps(asdict(config))) or start
             solved = fit_steered(scenes, config, report, checkpoint, device, steering, earlier, run.activity)
         if not isinstance(solved, Rescheduled):
             break
+        run.discard(PLAN)
         save_state(solved.state, json.dumps(asdict(solved.config)), run.file(EARLIER))  # the change takes effect
         run.write_json("config.json", asdict(solved.config) | {RESOLUTION: solved.resolution})  # with this file
     if steering.was_stopped:
         run.is_left_open = True
     else:
-        forget_object_poses(run)
+        run.discard(f"{KEPT_OBJECT_POSE}_*")
     run.reopen("mesh", "detail")  # of a surface that was stopped earlier
     return replace(solved, doubts=(*solved.doubts, *doubts))
+
+
+def kept_plan(source: Source, options: RunOptions, run: RunFolder) -> Plan | None:
+    """Return what fits into memory, decided and said once for all invocations of a run; None for a trained field."""
+    plan = read_kept(run.file(PLAN), Plan)
+    if plan is None and (plan := memory_plan(source, options)) is not None:
+        run.write_json(PLAN, asdict(plan))
+        run.progress(message=plan.sentence)
+    return plan
+
+
+def _within_memory(source: Source, plan: Plan | None, run: RunFolder, calibrated: CalibratedViews) -> CalibratedViews:
+    """Return the calibrations with as many photos in use as the plan allows, and update calibration.json."""
+    if plan is None:
+        return calibrated
+    thinned = within_plan(calibrated, plan, len(source.photos()))
+    used = [[x.used for one in some.every() for x in one.calibration.lights] for some in (calibrated, thinned)]
+    if used[0] != used[1]:
+        save_views(thinned, run.file(CALIBRATION))
+    return thinned
 
 
 def _photos_for(
@@ -304,8 +331,7 @@ def _photos_for(
     """Return the photos at the chosen resolution's size; only those stored in the run folder stay in memory."""
     kept, read = run.file(KEPT), photos.get()
     if chosen.long_side() != options.long_side():
-        plan = next((one.plan for one in read if one.error is None), None)
-        return read_photos(source, chosen, kept if kept.is_dir() else None, plan)
+        return read_photos(source, chosen, kept if kept.is_dir() else None)
     if not kept.is_dir():
         photos.forget()
     return read

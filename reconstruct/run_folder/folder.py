@@ -143,9 +143,11 @@ class RunFolder:
         """Write a JSON result atomically."""
         write_json(self.path / name, value)
 
-    def discard(self, name: str) -> None:
-        """Remove a file or folder that is no longer needed."""
-        _remove(self.path / name)
+    def discard(self, *names: str) -> None:
+        """Remove files and folders that are no longer needed; a * stands for any letters."""
+        for path in list(self.path.iterdir()):
+            if any(path.match(name) for name in names):
+                _remove(path)
 
     # --- resuming ----------------------------------------------------------------------------------------------------
 
@@ -191,8 +193,7 @@ class RunFolder:
             self.costs.pop(stage, None)
             if self.is_finished(stage):
                 self._manifest["finished"].remove(stage)
-        for path in [self.path / "config.json", self.path / PLAN, *self.path.glob("checkpoint*")]:
-            _remove(path)
+        self.discard("config.json", PLAN, "checkpoint*")
 
     def reopen(self, *stages: str) -> None:
         """Mark these stages to run again: their files are valid results, but not final."""
@@ -329,11 +330,7 @@ class RunFolder:
 
     def _start_again(self) -> None:
         """Forget the earlier run: its log, checkpoints and finished stages. Its results are overwritten later."""
-        for path in [
-            *(self.path / name for name in (LOG, "preview.ply", "config.json", KEPT, PLAN)),
-            *self.path.glob("checkpoint*"),
-        ]:
-            _remove(path)
+        self.discard(LOG, "preview.ply", "config.json", KEPT, PLAN, "checkpoint*")
         self._manifest, self.costs = {}, {}
         self._t0, self._cpu0 = self._now(), cpu_seconds()
 

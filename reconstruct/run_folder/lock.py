@@ -1,6 +1,5 @@
 """The lock of a run folder: a file with the id of the process that holds it."""
 
-import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -9,7 +8,7 @@ from pathlib import Path
 import psutil
 
 from capture.errors import Remedy, UserError
-from capture.files.atomic import TEMPORARY, read_json
+from capture.files.atomic import read_json, write_json
 
 try:
     import fcntl
@@ -29,15 +28,11 @@ def take_lock(folder: Path) -> None:
     Raises:
         UserError: another running process has the folder.
     """
-    me = psutil.Process()
-    text = json.dumps({"pid": me.pid, "started": me.create_time()})
-    path = folder / LOCK
+    me, path = psutil.Process(), folder / LOCK
     with _one_at_a_time(folder):
         if lock_holder(path) is None:
-            path.unlink(missing_ok=True)
-            with suppress(FileExistsError):  # only where the system has no lock of a folder
-                _place(text, path)
-                return
+            write_json(path, {"pid": me.pid, "started": me.create_time()})  # whole: nobody sees an empty one
+            return
     raise UserError(
         f"{folder} is in use by another shadowgraph (process {lock_holder(path)}).",
         "wait until it has finished",
@@ -49,15 +44,6 @@ def take_lock(folder: Path) -> None:
 def release_lock(folder: Path) -> None:
     """Release the folder."""
     (folder / LOCK).unlink(missing_ok=True)
-
-
-def is_abandoned(lock: Path) -> bool:
-    """Return True if a lock names a process that is gone; False if it cannot be read or is being written."""
-    try:
-        named = "pid" in read_json(lock)
-    except (OSError, ValueError, TypeError):
-        return False
-    return named and lock_holder(lock) is None
 
 
 def lock_holder(path: Path) -> int | None:
@@ -99,23 +85,3 @@ def _one_at_a_time(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(own)  # which also releases it
-
-
-def _place(text: str, lock: Path) -> None:
-    """Create the lock together with its content: an empty one would look like that of a process that is gone.
-
-    Raises:
-        FileExistsError: the lock exists already.
-    """
-    mine = lock.with_name(f".{lock.name}.{psutil.Process().pid}.new{TEMPORARY}")
-    mine.unlink(missing_ok=True)  # a link of that name would lead elsewhere
-    mine.write_text(text, encoding="utf-8")
-    try:
-        os.link(mine, lock)
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without links
-        with lock.open("x", encoding="utf-8") as file:
-            file.write(text)
-    finally:
-        mine.unlink()

@@ -1,6 +1,6 @@
 """Stages that are done once: a later invocation of the same run reads their results back when needed.
 
-What packages log of their steps, for a progress display.
+What the calibration logs of its steps, for a progress display.
 """
 
 import logging
@@ -14,28 +14,20 @@ from reconstruct.run_folder.folder import RunFolder
 T = TypeVar("T")
 
 
-class _Told(logging.Handler):
-    """Hands on what one thread logs."""
-
-    def __init__(self, say: Callable[[str], None], warn: Callable[[str], None]):
-        super().__init__(logging.INFO)
-        self._say, self._warn, self._thread = say, warn, threading.get_ident()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        if record.thread == self._thread:
-            say = self._warn if record.levelno >= logging.WARNING else self._say
-            say(record.getMessage())
-
-
 @contextmanager
-def log_to(package: str, say: Callable[[str], None], warn: Callable[[str], None]) -> Iterator[None]:
-    """Say what a package logs of its steps, as long as this lasts; of this thread alone, as runs may be side by side.
+def log_to(say: Callable[[str], None], warn: Callable[[str], None]) -> Iterator[None]:
+    """Say what the calibration logs of its steps while this lasts; of this thread alone, as runs may be side by side.
 
     Args:
-        package: name of its logger.
         warn: gets what it warns of; `say` gets the rest.
     """
-    logger, handler = logging.getLogger(package), _Told(say, warn)
+    logger, handler, thread = logging.getLogger("calibration"), logging.Handler(logging.INFO), threading.get_ident()
+
+    def emit(record: logging.LogRecord) -> None:
+        if record.thread == thread:
+            (warn if record.levelno >= logging.WARNING else say)(record.getMessage())
+
+    handler.emit = emit
     if logger.getEffectiveLevel() > logging.INFO:
         logger.setLevel(logging.INFO)
     logger.addHandler(handler)

@@ -19,7 +19,7 @@ from calibration.views.calibrate_views import ViewPhotos, calibrate_views
 from capture.errors import CalibrationError, ReconstructionError
 from reconstruct.fields import SolvedScene
 from reconstruct.render.g_buffer import surface_maps
-from reconstruct.source.photos import Photos, within_plan
+from reconstruct.source.photos import Photos
 from reconstruct.source.source import RunOptions, Source, ground_option
 
 UNKNOWN_SCALE = "scale: "  # beginning of the note that the given length replaces
@@ -64,8 +64,6 @@ def with_scale_of(calibration: Calibration, fields: SolvedScene, length: float, 
 def calibrate_source(source: Source, photos: Sequence[Photos], options: RunOptions) -> CalibratedViews:
     """Return a scene's given calibration, or calibrate the photos, with the lights from a file if --lights names one.
 
-    Photos beyond what fits into memory (`photos.plan`) are marked as not used.
-
     Args:
         photos: of every view, as read_photos reads them.
 
@@ -77,19 +75,13 @@ def calibrate_source(source: Source, photos: Sequence[Photos], options: RunOptio
             a light.
     """
     views = _calibrated(source, photos, options)
-    plan = next((one.plan for one in photos if one.error is None), None)
     has_scale, is_known = source.scale(options) is not None, source.ground_is_known(options)
-    every = len(source.photos())
 
     def finished(calibration: Calibration) -> Calibration:
         calibration = with_ground(calibration, options.ground, is_known, has_scale)
-        calibration = with_light_error(calibration, options.light_error)
-        return calibration if plan is None else within_plan(calibration, plan, every)
+        return with_light_error(calibration, options.light_error)
 
-    def all_finished(some: CalibratedViews) -> CalibratedViews:
-        return some.with_calibrations([finished(view.calibration) for view in some.views])
-
-    return replace(all_finished(views), object_poses=tuple(map(all_finished, views.object_poses)))
+    return views.changed(finished)
 
 
 def with_light_error(calibration: Calibration, relative: float) -> Calibration:

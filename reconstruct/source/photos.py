@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from msgspec import Meta
 
+from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
 from calibration.known_scene import KnownScene
 from calibration.scenes.shadowneus import read_ground_depth
@@ -125,10 +126,18 @@ def keep_spread(calibration: Calibration, count: int) -> Calibration:
     return replace(calibration, lights=tuple(lights))
 
 
-def within_plan(calibration: Calibration, plan: Plan, every: int) -> Calibration:
-    """Return the calibration of a view with its share of the photos that fit in use, of `every` photo of all views."""
-    share = max(FEWEST_LIT, plan.photos * len(calibration.lights) // every)
-    return keep_spread(calibration, min(share, plan.photos))
+def within_plan(calibrated: CalibratedViews, plan: Plan, every: int) -> CalibratedViews:
+    """Return the calibrations with as many photos of each view in use as is its share of those that fit.
+
+    Args:
+        every: photos of all views.
+    """
+
+    def thinned(calibration: Calibration) -> Calibration:
+        share = max(FEWEST_LIT, plan.photos * len(calibration.lights) // every)
+        return keep_spread(calibration, min(share, plan.photos))
+
+    return calibrated.changed(thinned)
 
 
 @dataclass(frozen=True)
@@ -140,19 +149,15 @@ class Photos:
     shadow: Float[np.ndarray, "photos height width"] | None = None  # 1 = lit
     mask: Float[np.ndarray, "mask_height mask_width"] | None = None  # 1 = object
     ground_depth: Float[np.ndarray, "full_height full_width"] | None = None
-    plan: Plan | None = None  # the part of them that fits into memory; None: all
     view: str = ""  # its name, where there are several
     error: CaptureError | None = None  # why one of several views cannot be read
 
 
-def read_photos(
-    source: Source, options: RunOptions, kept: Path | None = None, plan: Plan | None = None
-) -> tuple[Photos, ...]:
+def read_photos(source: Source, options: RunOptions, kept: Path | None = None) -> tuple[Photos, ...]:
     """Read and check the photos of each view, the given shadow pictures (if asked for or there are no photos), or both.
 
     Args:
         kept: a folder for intermediate results; results that it already holds are reused, see read_stack.
-        plan: the photos and pixels that fit into memory, from an earlier invocation; made now unless given.
 
     Returns:
         One for each of source.views(), in their order; where some of several cannot be read, with the `error`.
@@ -160,11 +165,10 @@ def read_photos(
     Raises:
         CaptureError: no view can be read: a photo cannot, the photos differ in size, or a mask fits none of them.
     """
-    plan = memory_plan(source, options) if plan is None else plan
     found = []
     for view in source.views():
         try:
-            found.append(_photos_of_view(view, options, kept and kept.joinpath(*view.name.split("/")), plan))
+            found.append(_photos_of_view(view, options, kept and kept.joinpath(*view.name.split("/"))))
         except CaptureError as error:
             found.append(Photos(None, view=view.name, error=error))
     errors = [one.error for one in found if one.error is not None]
@@ -173,12 +177,12 @@ def read_photos(
     return tuple(found)
 
 
-def _photos_of_view(source: Source, options: RunOptions, kept: Path | None, plan: Plan | None) -> Photos:
+def _photos_of_view(source: Source, options: RunOptions, kept: Path | None) -> Photos:
     kept = None if kept is None else kept / str(options.long_side())
     if source.session is not None:
-        return replace(_photos_of_session(source.session, options, kept, plan), view=source.name)
+        return replace(_photos_of_session(source.session, options, kept), view=source.name)
     assert source.known is not None
-    photos = _photos_of_scene(source.known, options, kept, plan)
+    photos = _photos_of_scene(source.known, options, kept)
     return photos if source.ground_is_known(options) else _without_left_out(photos, source.known)
 
 
@@ -194,7 +198,7 @@ def memory_plan(source: Source, options: RunOptions) -> Plan | None:
     return plan_for(len(source.photos()), *read_size(source.photos()[0]), options.preset, room)
 
 
-def _photos_of_session(session: Session, options: RunOptions, kept: Path | None, plan: Plan | None) -> Photos:
+def _photos_of_session(session: Session, options: RunOptions, kept: Path | None) -> Photos:
     long_side = options.long_side()
     stack = read_stack(session.lit, long_side, kept=kept)
     dark_stack = read_stack(session.dark, long_side, stack.reference) if session.dark else None
@@ -210,10 +214,10 @@ def _photos_of_session(session: Session, options: RunOptions, kept: Path | None,
     stack, changed = with_one_white_balance(stack)
     findings = (*session.left_out, *findings, *map(white_balance_finding, changed, changed.values()))
     mask = _users_mask(session, stack) if options.mask == "auto" else None
-    return Photos(stack, findings, mask=mask, plan=plan)
+    return Photos(stack, findings, mask=mask)
 
 
-def _photos_of_scene(known: KnownScene, options: RunOptions, kept: Path | None, plan: Plan | None) -> Photos:
+def _photos_of_scene(known: KnownScene, options: RunOptions, kept: Path | None) -> Photos:
     wants_shadow = options.input in ("shadow", "both") or known.rgb_paths is None
     wants_rgb = options.input != "shadow" and known.rgb_paths is not None
     mask = _given_mask(known) if options.mask == "auto" else None
@@ -229,7 +233,7 @@ def _photos_of_scene(known: KnownScene, options: RunOptions, kept: Path | None, 
             stack = without_ambient(stack, dark)
     path = known.ground_depth_path if options.ground == AUTO else None
     ground_depth = None if path is None else read_ground_depth(path, known.calibration.camera)
-    return Photos(stack, known.photos.left_out, shadow, mask, ground_depth=ground_depth, plan=plan)
+    return Photos(stack, known.photos.left_out, shadow, mask, ground_depth=ground_depth)
 
 
 def _without_left_out(photos: Photos, known: KnownScene) -> Photos:

@@ -29,18 +29,8 @@ AUTO, UNKNOWN = "auto", "unknown"  # of --ground, which may be a height instead
 CALIBRATION_LONG_SIDE = 800  # px: checks and light fit average over patches of ground, finer photos add nothing
 LONG_SIDES = {"draft": 320, "standard": 640, "fine": 1024, "paper": 800}  # px that the solver looks at, by preset
 LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond it, shadows and shading constrain the lights better
-DESCRIPTIONS = (
-    "*.json",
-    "*.txt",
-    "*.npz",
-    "*.npy",
-    "*.lp",
-    "*/*.lp",
-    "*.csv",
-    "light*.mat",
-    "*.dome",
-    "session.toml",
-)  # files that may describe a known scene
+# Files that may describe a known scene.
+DESCRIPTIONS = ("*.json", "*.txt", "*.npz", "*.npy", "*.lp", "*/*.lp", "*.csv", "light*.mat", "*.dome", "session.toml")
 WITHOUT_BOARD = (
     "Without a board, the directions of the lights are missing, which a shiny ball in the picture would tell (none was "
     "found; session.toml may name it: ball = [x, y, radius], pixels)."
@@ -136,20 +126,12 @@ class Source:
                 own = session.folder / SETTINGS_FILE
                 found += [own] if own.is_file() else []
                 found += [*session.board, *session.lit, *session.light, *session.dark, *session.side]
-                found += [path for path in (session.mask, session.phone_back) if path]
+                found += filter(None, (session.mask, session.phone_back))
             return list(dict.fromkeys((*found, *(path for one in captures for path in one.board))))
         assert self.known is not None
-        mask = [self.known.mask_path] if self.known.mask_path else []
         texts = sorted(path for kind in DESCRIPTIONS for path in self.folder.glob(kind))
-        uneven = [self.known.ground_depth_path] if self.known.ground_depth_path else []
-        return [
-            *texts,
-            *uneven,
-            *(self.known.rgb_paths or ()),
-            *(self.known.shadow_paths or ()),
-            *self.known.dark_paths,
-            *mask,
-        ]
+        pictures = (*(self.known.rgb_paths or ()), *(self.known.shadow_paths or ()), *self.known.dark_paths)
+        return [*texts, *filter(None, (self.known.ground_depth_path, *pictures, self.known.mask_path))]
 
     def ground_is_known(self, options: RunOptions) -> bool:
         """Return True if the ground plane is given, by --ground or by the folder itself."""

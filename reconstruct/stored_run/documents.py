@@ -15,7 +15,7 @@ from capture.decode.formats import is_photo_name
 from capture.errors import ReconstructionError
 from capture.files.names import refuse_no_folder
 from capture.files.regular import why
-from capture.files.schema import FileName, NotNegative, Number, Text, Vector, as_type, check_numbers, read_as
+from capture.files.schema import FileName, NotNegative, Number, Text, Vector, read_as
 
 REPORT, MANIFEST, CHECK = "report.json", "manifest.json", "check.json"
 MANIFEST_FORMAT = 1
@@ -122,17 +122,6 @@ def read_report(path: Path) -> dict[str, Any]:
         CalibrationError: it cannot be read, or a value is of another kind; names it.
     """
     return _without_null(read_as(path, _Report, RUN_AGAIN)[1])
-
-
-def checked_report(report: Any, file: str) -> dict[str, Any]:
-    """Return a part of a report.json that another file holds, after the check that `read_report` makes.
-
-    Raises:
-        CalibrationError: a value is of another kind; names it.
-    """
-    check_numbers(report, file, RUN_AGAIN)
-    as_type(report, _Report, file, RUN_AGAIN)
-    return _without_null(report)
 
 
 def _without_null(document: dict[str, Any]) -> dict[str, Any]:

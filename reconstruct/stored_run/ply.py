@@ -69,12 +69,7 @@ def read_mesh(path: Path) -> "trimesh.Trimesh":
     import trimesh
 
     found = read_triangles(path)
-    mesh = trimesh.Trimesh(
-        found.vertices,
-        found.faces,
-        vertex_colors=found.colours,
-        process=False,
-    )
+    mesh = trimesh.Trimesh(found.vertices, found.faces, vertex_colors=found.colours, process=False)
     known = {"evidence": found.evidence, "sigma": found.sigma}
     mesh.vertex_attributes |= {name: values for name, values in known.items() if values is not None}
     return mesh

@@ -13,7 +13,7 @@ from capture.errors import UserError
 from capture.files.regular import is_own_folder
 from reconstruct.run_folder.folder import LOG, read_log
 from reconstruct.run_folder.forecast import STAGE_NAMES, Forecast
-from reconstruct.run_folder.lock import LOCK, is_abandoned
+from reconstruct.run_folder.lock import LOCK, lock_holder
 from reconstruct.run_folder.requests import PAUSED, REQUESTS_FOLDER
 from reconstruct.stored_run.maps import THUMBS, read_thumbnail
 from reconstruct.stored_run.stored_run import CALIBRATION, FIELDS, MESH
@@ -94,7 +94,7 @@ class RunFollower:
 
     def is_running(self) -> bool:
         """Return whether a living process holds this run."""
-        return (self.path / LOCK).exists() and not is_abandoned(self.path / LOCK)
+        return lock_holder(self.path / LOCK) is not None
 
     def since_last_line_s(self) -> float:
         """Return the seconds since the log was written to, or, before it is there, since the run took the folder."""
