@@ -43,10 +43,9 @@ from calibration.flashlight.fit import (
     with_oval_beams,
     without_gloss,
 )
-from calibration.flashlight.model import NOISE, Flashlights, cosines, free_tangent
+from calibration.flashlight.model import NOISE, cosines, free_tangent
 from calibration.flashlight.outline_lights import OUTLINE_SIDE, outline_sigma, with_outlines
 from calibration.flashlight.pictured import as_pictured, with_response
-from calibration.flashlight.wall import WALL_TERMS
 from calibration.light import Light, Vector
 from calibration.lights import hand
 from calibration.lights.ground_cells import ground_ends
@@ -136,7 +135,9 @@ def describe(
 def _colour(fit: FlashlightFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:
     """Power per photo and channel, and ambient irradiance: the grey fit repeated per channel with fixed geometry."""
     cells = fit.evidence.cells
-    held = _powers_only(fit.flashlights)
+    n, own, terms = len(fit.flashlights.positions), fit.flashlights.per_flashlight(), len(fit.flashlights.beam)
+    vary = [*(own * k + 6 for k in range(n)), own * n + terms]  # powers and ambient light
+    held = np.eye(own * n + fit.flashlights.shared())[:, vary]
     powers, ambients = [], []
     for channel in range(3):
         evidence = replace(fit.evidence, log_grey=np.log(np.maximum(cells.rgb[..., channel], 1e-9)))
@@ -146,13 +147,6 @@ def _colour(fit: FlashlightFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:
         powers.append(np.exp(flashlights.log_power - shift))
         ambients.append(flashlights.ambient * np.exp(-shift))
     return np.stack(powers, -1) * hand.USUAL**2, np.array(ambients)
-
-
-def _powers_only(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
-    """Return the tangent that varies only powers and ambient light."""
-    n, own, terms = len(flashlights.positions), flashlights.per_flashlight(), len(flashlights.beam)
-    columns = [*(own * k + 6 for k in range(n)), own * n + terms]
-    return np.eye(own * n + terms + 4 + WALL_TERMS)[:, columns]
 
 
 def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: list[str]) -> list[str]:
