@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -19,8 +20,10 @@ from calibration.flashlight.light_estimate import LightFit, locate_lights
 from calibration.flashlight.phone import MIN_VIEWS, PhoneViews, locate_lights_from_phone
 from calibration.flashlight.solids import fuse_shadow_lights, locate_sun
 from calibration.light import Light
+from calibration.lights.files import read_opinions
 from calibration.lights.mixed_light import SECOND_LIGHT, MixedLight, mixture_of
 from calibration.lights.power import on_albedo_scale
+from calibration.lights_of_file import lights_of_file, refuse_below, with_opinions
 from calibration.outlines.metric_cues import MetricCues
 from calibration.posed_camera import PosedCamera
 from calibration.reframed import reframed, with_doubt
@@ -33,13 +36,14 @@ from capture.photos.photo import PhotoStack, read_photo
 from capture.session.session import Session
 
 WAYS = ("auto", "shading", "phone")
+Find = Callable[[Callable[[LightFit], bool], Bool[np.ndarray, " photos"]], tuple[LightFit, list[str]]]  # as _lights
 
 
 def calibrate(
     session: Session,
     stack: PhotoStack,
     board_spec: str | None = None,
-    lights: str = "auto",
+    lights: str | Path = "auto",
     findings: Sequence[Finding] = (),
     on_board: BoardFit | None = None,
 ) -> Calibration:
@@ -49,14 +53,19 @@ def calibrate(
         stack: the session's lit photos, in their order.
         board_spec: as parse_board reads it; None: session.toml's board, or else the board is recognised.
         lights: "shading": from the ground alone; "phone": from the flashlight phone's photos; "auto": from those where
-            they show the board, else from the ground.
+            they show the board, else from the ground; a path: from that file, which may give a photo several. A list
+            whose entries all have a sigma is combined light by light with the estimates from the photos; photos that
+            it lacks keep their own estimates.
         findings: of check_stack; photos with a finding that drops them get no light.
         on_board: camera and ground, where they are found already, for several views together.
 
     Raises:
-        CalibrationError: the board, the ground or the lights cannot be found.
+        CalibrationError: the board, the ground or the lights cannot be found, or as lights_of_file.
     """
-    if lights not in WAYS:
+    if isinstance(lights, Path) and (opinions := read_opinions(lights)) is not None:
+        refuse_below(opinions, 0.0, lights)
+        return with_opinions(calibrate(session, stack, board_spec, "auto", findings, on_board), opinions, lights)
+    if isinstance(lights, str) and lights not in WAYS:
         raise ValueError(f"lights is {lights!r}, one of {', '.join(WAYS)} is needed")
     posed_camera, lens, residuals = on_board or fit_board(session, board_spec)
     refuse_other_size(posed_camera.camera, stack)
@@ -64,36 +73,24 @@ def calibrate(
     dropped, usable = left_out(stack, findings)
     board = parse_board(residuals["board"])
     cues, sides = metric_cues(session, stack, usable, posed_camera, board, lens.on_sheet)
-    declared = session.settings
-    if declared.lights_at_once > 1:
-        at_once = f"{session.folder}: session.toml declares {declared.lights_at_once} lights at once"
-        wanted = "which the ground's shading cannot separate; their positions are needed, a line for each."
-        raise CalibrationError(f"{at_once}, {wanted}", Remedy.LIGHTS_FILE)
-    mixtures: list[str] = []
-    if declared.light == "sun":
-        fit = locate_sun(stack, posed_camera, usable, declared.solids)
-        notes = ["lights: from the shadows of declared objects"]
+    if isinstance(lights, Path):
+        fit, notes, has_power = lights_of_file(lights, session, stack, posed_camera, dropped)
+        every, mixtures = fit.lights, []
     else:
         find = partial(_lights, session, stack, posed_camera, board, lights, cues)
-        fit, notes, spoilt, mixtures = _unmixed(find, stack, usable)
-        usable = usable & ~spoilt
+        fit, notes, spoilt, mixtures = _as_declared(find, session, stack, posed_camera, usable)
         dropped |= {path.name: SECOND_LIGHT for path, one in zip(stack.paths, spoilt, strict=True) if one}
-        if declared.solids:
-            fit, more = fuse_shadow_lights(fit, stack, posed_camera, declared.solids)
-            notes = [*notes, *more]
-    covariance = np.array(residuals["pose_covariance"])
-    found = iter(with_camera_error(with_doubt(fit.lights, posed_camera, doubt), posed_camera, covariance))
-    every = tuple(
-        next(found) if use else _unknown_light(path.name, dropped[path.name], fit)
-        for path, use in zip(stack.paths, usable, strict=True)
-    )
+        covariance, doubted = np.array(residuals["pose_covariance"]), with_doubt(fit.lights, posed_camera, doubt)
+        by_name = {light.photo: light for light in with_camera_error(doubted, posed_camera, covariance)}
+        names, has_power = [path.name for path in stack.paths], False
+        every = tuple(by_name.get(name) or _unknown_light(name, dropped[name], fit) for name in names)
     notes = [*session.notes, *residuals.get("notes", []), *framing_notes, *notes, *side_notes(sides)]
-    wider = doubt.of_ground(posed_camera, residuals)
     rows = {"side_photos": [side.row() for side in sides], "left_out_photos": [one.row() for one in session.left_out]}
     rows |= {"notes": notes, "warnings": [*residuals.get("warnings", []), *mixtures]}
-    residuals = residuals | fit.residuals | wider | rows
+    residuals = residuals | fit.residuals | doubt.of_ground(posed_camera, residuals) | rows
     shared = {"beam": fit.beam, "ambient": fit.ambient, "residuals": residuals, "side_views": cues.views}
-    return on_albedo_scale(Calibration.of(posed_camera, every, **shared), stack)
+    found = Calibration.of(posed_camera, every, **shared)
+    return found if has_power else on_albedo_scale(found, stack)
 
 
 def with_camera_error(
@@ -133,10 +130,27 @@ def left_out(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[dict[str, 
     return {name: f"{one.kind}: {one.text}" for name, one in dropped.items()}, usable
 
 
+def _as_declared(
+    find: Find, session: Session, stack: PhotoStack, posed_camera: PosedCamera, usable: Bool[np.ndarray, " photos"]
+) -> tuple[LightFit, list[str], Bool[np.ndarray, " photos"], list[str]]:
+    """Return what _unmixed does, with the help of the objects and lights that session.toml declares."""
+    declared = session.settings
+    if declared.lights_at_once > 1:
+        at_once = f"{session.folder}: session.toml declares {declared.lights_at_once} lights at once"
+        wanted = "which the ground's shading cannot separate; their positions are needed, a line for each."
+        raise CalibrationError(f"{at_once}, {wanted}", Remedy.LIGHTS_FILE)
+    if declared.light == "sun":
+        fit = locate_sun(stack, posed_camera, usable, declared.solids)
+        return fit, ["lights: from the shadows of declared objects"], np.zeros_like(usable), []
+    fit, notes, spoilt, said = _unmixed(find, stack, usable)
+    if declared.solids:
+        fit, more = fuse_shadow_lights(fit, stack, posed_camera, declared.solids)
+        notes = [*notes, *more]
+    return fit, notes, spoilt, said
+
+
 def _unmixed(
-    find: Callable[[Callable[[LightFit], bool], Bool[np.ndarray, " photos"]], tuple[LightFit, list[str]]],
-    stack: PhotoStack,
-    usable: Bool[np.ndarray, " photos"],
+    find: Find, stack: PhotoStack, usable: Bool[np.ndarray, " photos"]
 ) -> tuple[LightFit, list[str], Bool[np.ndarray, " photos"], list[str]]:
     """Return the lights, notes, which usable photos a second light spoilt, and what is said of light that is mixed.
 

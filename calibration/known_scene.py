@@ -22,9 +22,7 @@ class KnownScene:
     ground_known: bool = True  # False: calibration.ground_height is an assumption
     ground_depth_path: Path | None = None  # of uneven ground, see calibration.scenes.shadowneus
     is_linear: bool = False  # the numbers in 8 and 16-bit photos are linear, not sRGB-encoded
-    left_out: tuple[float, float, float] | None = (
-        None  # x, y, radius (px) of what is no object: a ball that shows light
-    )
+    left_out: tuple[float, float, float] | None = None  # x, y, radius (px) of a ball that shows light: no object
     dark_paths: tuple[Path, ...] = ()  # photos without light, which are subtracted
     lights_from: Path | None = None  # the user's file of lights that they come from
     notes: tuple[str, ...] = ()  # what was found, and what had to be assumed

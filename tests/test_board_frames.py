@@ -6,16 +6,15 @@ import cv2
 import numpy as np
 import pytest
 from board_photos import board_photo, corners_of, session_of, slanted
+from test_board import CAMERA, off_px
 
 from calibration.board.board import Board, parse_board
 from calibration.board.board_photos import fit_board
 from calibration.board.board_pose import fit_ground
 from calibration.board.corners import _fits_the_rest, find_board
 from calibration.board.recognise import guess_board
-from calibration.camera import Camera
 from capture.errors import CalibrationError
 
-CAMERA = Camera(1000, 750, 1000.0, 1000.0, 503.0, 371.0)
 SPECS = ("charuco:5x7:30:22:DICT_4X4_50", "charuco:6x8:25:18:DICT_5X5_100", "charuco:13x9:20:16:DICT_6X6_250")
 
 
@@ -40,10 +39,6 @@ def covered(photo: np.ndarray, outline: np.ndarray, by: np.ndarray | int) -> np.
 def frame_photo(board: Board, pose, is_legacy=False) -> np.ndarray:
     """Only the outermost squares are seen, none of whose inner corners is."""
     return covered(board_photo(board, CAMERA, pose, is_legacy=is_legacy), middle_of(board, pose, 0.98), 140)
-
-
-def off_px(corners, pose) -> np.ndarray:
-    return np.linalg.norm(corners.pixels - CAMERA.project(pose.inverse().apply(corners.points)), axis=1)
 
 
 def assert_right_ground(corners, pose) -> None:

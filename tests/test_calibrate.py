@@ -10,9 +10,7 @@ import pytest
 from flashlight_photos import POSED_CAMERA, Recipe, photograph
 
 import calibration.calibrate as glue
-import calibration.calibrate_with_file as from_file
 from calibration.calibrate import calibrate
-from calibration.calibrate_with_file import calibrate_with_file
 from calibration.calibration import load_calibration, save_calibration
 from calibration.flashlight.light_estimate import LightFit
 from calibration.flashlight.phone import PhoneViews
@@ -36,9 +34,7 @@ def photographed():
 @pytest.fixture
 def truth(monkeypatch, photographed):
     residuals = {"board": "checkerboard:9x6:20", "notes": [], "pose_covariance": np.zeros((6, 6)).tolist()}
-    found = (POSED_CAMERA, residuals)
-    for module in (glue, from_file):
-        monkeypatch.setattr(module, "fit_board", lambda session, spec: (found[0], FLAT_SHEET, found[1]))
+    monkeypatch.setattr(glue, "fit_board", lambda session, spec: (POSED_CAMERA, FLAT_SHEET, residuals))
     return photographed
 
 
@@ -69,10 +65,7 @@ def test_where_nearly_all_photos_are_left_out_the_refusal_says_why(truth, tmp_pa
     with pytest.raises(
         CalibrationError, match=r"^3 of 8 photos .*\. IMG_0003\.jpg, .*: over-exposed, 40% .*expose less"
     ):
-        if named:
-            calibrate_with_file(session_of(truth), truth.stack, tmp_path / "lights.lp", None, findings)
-        else:
-            calibrate(session_of(truth), truth.stack, findings=findings)
+        calibrate(session_of(truth), truth.stack, None, tmp_path / "lights.lp" if named else "auto", findings)
 
 
 @pytest.mark.parametrize(
@@ -87,28 +80,25 @@ def test_a_list_of_lights_below_the_ground_or_in_metres_is_refused_by_its_own_na
     rows = [{"photo": x.photo, "position": (np.array(x.position) * factor).tolist()} | more for x in truth.lights]
     (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}))
     with pytest.raises(CalibrationError, match=rf"lights\.json puts {said}"):
-        calibrate_with_file(session_of(truth), truth.stack, tmp_path / "lights.json")
+        calibrate(session_of(truth), truth.stack, lights=tmp_path / "lights.json")
 
 
 def test_photos_from_the_side_count_with_lights_from_a_file_too(truth, tmp_path, monkeypatch):
     view = SideView("a.jpg", POSED_CAMERA, (0, 0, 8, 6), np.eye(6, 8) > 0, np.ones((6, 8), bool), 0.5)
     found = [SideResult("a.jpg", view, ""), SideResult("b.jpg", None, "the board was not found in it")]
-    monkeypatch.setattr(from_file, "metric_cues", lambda *_: (MetricCues((view,)), found))
+    monkeypatch.setattr(glue, "metric_cues", lambda *_: (MetricCues((view,)), found))
     rows = [{"photo": light.photo, "position": np.array(light.position).tolist()} for light in truth.lights]
     (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}))
-    result = calibrate_with_file(session_of(truth), truth.stack, tmp_path / "lights.json")
+    result = calibrate(session_of(truth), truth.stack, lights=tmp_path / "lights.json")
     assert [one.photo for one in result.side_views] == ["a.jpg"]
     assert "side/b.jpg was not used: the board was not found in it" in result.residuals["notes"]
     assert truth.errors(result.lights).max() == 0
 
 
-def test_photos_of_another_size_than_the_board_photo_are_refused(truth, tmp_path):
-    (tmp_path / "lights.lp").write_text("\n".join(f"{path.name} 0 0 1" for path in truth.stack.paths))
+def test_photos_of_another_size_than_the_board_photo_are_refused(truth):
     turned = replace(truth.stack, full_width=480, full_height=640)
     with pytest.raises(CalibrationError, match=r"is 640x480 px, .* are 480x640.*orientation\.$"):
         calibrate(session_of(truth), turned)
-    with pytest.raises(CalibrationError, match=r"is 640x480 px, .* are 480x640"):
-        calibrate_with_file(session_of(truth), turned, tmp_path / "lights.lp")
     filmed = replace(turned, paths=tuple(frame_path(Path("a.mov"), float(k)) for k in range(len(turned.paths))))
     with pytest.raises(CalibrationError, match="Film the board, too"):
         calibrate(session_of(truth), filmed)

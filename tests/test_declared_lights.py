@@ -9,7 +9,7 @@ from flashlight_photos import CAMERA, POSED_CAMERA, WORLD_FROM_CAMERA, Recipe, T
 from calibration.flashlight.light_estimate import LightFit
 from calibration.flashlight.solids import fuse_shadow_lights, locate_sun
 from calibration.light import Light
-from calibration.lights.fusion import disagree, fuse
+from calibration.lights.fusion import fuse
 from capture.errors import CalibrationError, CaptureError
 from capture.session.declared_objects import Solid
 from capture.session.session import load_settings
@@ -109,11 +109,11 @@ def test_one_cube_gives_the_direction():
 def test_opinions_count_by_their_covariance_and_contradictions_widen_the_result():
     near, far = np.zeros(3), np.array([0.0, 0.0, 30.0])
     sure, rough = np.diag([1.0, 1.0, 100.0]), np.diag([100.0, 100.0, 1.0])
-    place, covariance, ratio = fuse([near, far], [sure, rough])
+    place, covariance, contradict = fuse([near, far], [sure, rough])
     np.testing.assert_allclose(place, [0.0, 0.0, 30.0 * 100 / 101], atol=1e-6)
-    assert not disagree(ratio) and covariance[0, 0] < 3
-    _, wide, ratio = fuse([near, far], [sure, np.eye(3)])
-    assert disagree(fuse([near, far], [np.eye(3), np.eye(3)])[2])
+    assert not contradict and covariance[0, 0] < 3
+    _, wide, _ = fuse([near, far], [sure, np.eye(3)])
+    assert fuse([near, far], [np.eye(3), np.eye(3)])[2]
     assert wide[2, 2] > np.linalg.inv(np.linalg.inv(sure) + np.eye(3))[2, 2]
 
 

@@ -20,6 +20,7 @@ from dataset_folders import (
 from PIL import Image
 from synthetic import BALL, Look, render
 from test_known import write_scene
+from test_left_out import BREAKS, truncated
 
 import shadowgraph
 from calibration.scenes.importers import import_folder
@@ -53,19 +54,11 @@ def by_order(folder, truth):
     return folder
 
 
-def truncated(path):
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
-def empty(path):
-    path.write_bytes(b"")
-
-
 def other_size(path):
     Image.new("RGB", (SIDE + 8, SIDE), "grey").save(path)
 
 
-FAULTS = {"truncated": (truncated, "unreadable"), "empty": (empty, "unreadable"), "size": (other_size, "another size")}
+FAULTS = {how: (BREAKS[how], "unreadable") for how in ("truncated", "empty")} | {"size": (other_size, "another size")}
 
 
 def photos_of(place):

@@ -12,11 +12,11 @@ from dataset_folders import write_s3nerf, write_shadowneus, write_shadowneus_rea
 from flashlight_photos import CAMERA, POSED_CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights, photograph
 from synthetic import Look, render
 
-from calibration.calibrate_with_file import with_opinions
 from calibration.calibration import Calibration, save_calibration
 from calibration.lights.files import read_lights, read_opinions
 from calibration.lights.layouts import BLENDER
 from calibration.lights.power import SHADING_MISFIT, with_power_per_photo
+from calibration.lights_of_file import with_opinions
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError

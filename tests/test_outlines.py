@@ -133,6 +133,14 @@ def test_a_penumbra_is_wider_the_higher_its_edge_and_the_lower_its_light(ball):
         assert found == pytest.approx(half, rel=0.35)  # the edge is not at the foot, and h is not small
 
 
+def spots_on(residual: np.ndarray, camera, mask: np.ndarray, usable: np.ndarray) -> MirrorHighlights:
+    """The highlights of bare ground around the object's mask, of which photos show this residual."""
+    flat, likelihood = np.zeros((HEIGHT, WIDTH), np.float32), np.where(mask, 1.0, -1.0).astype(np.float32)
+    field = GroundField(flat, 0 * residual, residual, usable, flat + 1)
+    shadows = GroundShadows(np.ones_like(residual), np.full(len(residual), -2.0), likelihood, mask)
+    return find_highlights(field, shadows, ground_points(camera)[0])
+
+
 def _mirrored(lights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where the ground mirrors each light into the eye: image points of a light under the ground, seen through it."""
     below = lights * [1, 1, -1]
@@ -152,11 +160,7 @@ def test_a_varnished_table_shows_where_it_mirrors_the_lights(ball):
     ground, _ = ground_points(camera)
     excess = np.exp(-((np.linalg.norm(ground - points[:, None, None], axis=-1) / 25) ** 2)).astype(np.float32)
     mask = hits_ball(np.broadcast_to(EYE, ground.shape), ground)
-    flat = np.zeros((HEIGHT, WIDTH), np.float32)
-    field = GroundField(flat, 0 * excess, excess, np.ones(excess.shape, bool), flat + 1)
-    likelihood = np.where(mask, 1.0, -1.0).astype(np.float32)
-    shadows = GroundShadows(np.ones_like(excess), np.full(len(lights), -2.0), likelihood, mask)
-    spots = find_highlights(field, shadows, ground)
+    spots = spots_on(excess, camera, mask, np.ones(excess.shape, bool))
     assert len(spots) >= 5
     half = [
         (lights[k] - p) / np.linalg.norm(lights[k] - p) + (EYE - p) / np.linalg.norm(EYE - p)
@@ -169,15 +173,11 @@ def test_a_varnished_table_shows_where_it_mirrors_the_lights(ball):
 def test_a_saturated_spot_at_the_border_is_found_and_one_whose_middle_is_out_of_sight_is_not(ball):
     """Nor is a fainter one taken in its place; the first photo's is whole, which tells how high spots are."""
     camera, _, _ = ball
-    ground, _ = ground_points(camera)
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     middles = [(WIDTH / 2, HEIGHT - 40.0), (80.0, HEIGHT - 8.0), (80.0, HEIGHT + 10.0)]
     light = np.stack([3 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / 20**2) for x, y in middles]).astype(np.float32)
     light[2] += 0.3 * np.exp(-((u - 50) ** 2 + (v - HEIGHT / 2) ** 2) / 10**2)
-    flat = np.zeros((HEIGHT, WIDTH), np.float32)
-    field = GroundField(flat, 0 * light, np.minimum(light, 1.2), light < 1, flat + 1)
-    shadows = GroundShadows(np.ones_like(light), np.full(len(light), -2.0), flat - 1, flat > 1)
-    spots = find_highlights(field, shadows, ground)
+    spots = spots_on(np.minimum(light, 1.2), camera, np.zeros((HEIGHT, WIDTH), bool), light < 1)
     assert spots.photos.tolist() == [0, 1]
     assert np.abs(camera.project(spots.points) - middles[:2]).max() < 2.5  # px
     assert spots.sigma[1] > spots.sigma[0]
@@ -187,11 +187,7 @@ def test_matt_tables_show_no_highlights(ball):
     camera, lights, _ = ball
     rng = np.random.default_rng(3)
     noise = (0.03 * rng.standard_normal((len(lights), HEIGHT, WIDTH))).astype(np.float32)
-    flat = np.zeros((HEIGHT, WIDTH), np.float32)
-    field = GroundField(flat, 0 * noise, noise, np.ones(noise.shape, bool), flat + 1)
-    shadows = GroundShadows(np.ones_like(noise), np.full(len(lights), -2.0), flat - 1, flat > 1)
-    ground, _ = ground_points(camera)
-    assert len(find_highlights(field, shadows, ground)) == 0
+    assert len(spots_on(noise, camera, np.zeros((HEIGHT, WIDTH), bool), np.ones(noise.shape, bool))) == 0
 
 
 def test_rows_are_derivatives_of_the_highlights_cost(ball):

@@ -133,8 +133,8 @@ THREE = BackOfPhone(lenses=((-22.0, 60.0, 6.5), (-22.0, 44.0, 6.5), (-8.0, 40.0,
 OFFSETS = np.array([[10.0, -8.0], [10.0, 8.0], [-4.0, 12.0]])  # from each lens to the LED, x and y of the back
 
 
-def read(tmp_path: Path, phone: BackOfPhone, given: PhoneBack | None = None) -> BackView:
-    path = save_back(tmp_path / "phone_back.png", back_photo(phone))
+def read(tmp_path: Path, phone: BackOfPhone | np.ndarray, given: PhoneBack | None = None) -> BackView:
+    path = save_back(tmp_path / "phone_back.png", back_photo(phone) if isinstance(phone, BackOfPhone) else phone)
     return read_phone_back(path, BESIDE, given or PhoneBack())
 
 
@@ -187,6 +187,7 @@ def test_without_a_top_of_the_board_the_turn_is_told_by_the_shading_alone():
         (BackOfPhone(spots=((10.0, 10.0),)), r"2 saturated spots .* led_px = \["),
         (BackOfPhone(is_lit=False), "no lit LED was found"),
         (BackOfPhone(lenses=()), "no lens was found .* name the main lens"),
+        (np.full((300, 400), 90, np.uint8), "the board was not found in phone_back"),
     ],
 )
 def test_what_cannot_be_told_is_refused_with_what_to_do(tmp_path, phone, said):
@@ -202,12 +203,6 @@ def test_what_session_toml_names_is_not_searched(tmp_path):
     np.testing.assert_allclose(offsets(named), offsets(found), atol=0.3)
     with pytest.raises(CalibrationError, match=r"led_px .* is 9000, 10; phone_back.png is 1600 x 1200 px"):
         read(tmp_path, unlit, PhoneBack((9000.0, 10.0), (1.0, 1.0)))
-
-
-def test_a_photo_without_the_board_is_refused(tmp_path):
-    path = save_back(tmp_path / "phone_back.png", np.full((300, 400), 90, np.uint8))
-    with pytest.raises(CalibrationError, match="the board was not found in phone_back"):
-        read_phone_back(path, BESIDE, PhoneBack())
 
 
 def test_the_photo_beside_session_toml_is_none_of_the_captures_photos(tmp_path):

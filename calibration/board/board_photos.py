@@ -90,22 +90,19 @@ def fit_boards(
     names = [photo.path.name for photo in photos]
     board, notes = _named_board([photo.grey for photo in photos], board_spec or sessions[0].settings.board, names)
     is_named = bool(board_spec or sessions[0].settings.board)
-    found: dict[int, list[_Photo]] = {}
-    fits: list[BoardFit | CalibrationError] = []
-    for view, session in enumerate(sessions):
-        own = _searched([photo for photo in photos if photo.view == view], session, board, len(sessions) == 1)
-        if isinstance(own, CalibrationError):
-            fits.append(own)
-        else:
-            found[view] = own
-            fits.append(CalibrationError(""))
+    searched = [
+        _searched([photo for photo in photos if photo.view == view], session, board, len(sessions) == 1)
+        for view, session in enumerate(sessions)
+    ]
+    found = {view: own for view, own in enumerate(searched) if isinstance(own, list)}
+    fits: dict[int, BoardFit | CalibrationError] = {k: e for k, e in enumerate(searched) if not isinstance(e, list)}
     extra = [replace(one, corners=find_board(one.grey, board, True)) for one in photos if one.view == COMMON]
     for group in _lens_groups(found):
-        for view, fit in zip(group, _fit_group([found[view] for view in group], extra, notes, is_named), strict=True):
-            fits[view] = fit
+        fits.update(zip(group, _fit_group([found[view] for view in group], extra, notes, is_named), strict=True))
     stated = sessions[0].settings.board_thickness_mm
     thickness = board.thickness_mm if stated is None else stated
-    return [fit if isinstance(fit, CalibrationError) else _on_table(fit, thickness) for fit in fits]
+    every = [fits[view] for view in range(len(sessions))]
+    return [fit if isinstance(fit, CalibrationError) else _on_table(fit, thickness) for fit in every]
 
 
 def _on_table(fit: BoardFit, thickness_mm: float) -> BoardFit:

@@ -184,7 +184,7 @@ def _chosen_lens(plain: Solution, photos: Sequence[Corners], size: tuple[int, in
     return best
 
 
-def _prior(size: tuple[int, int], focal_35mm: float | None, focal_sigma: float, lens: Lens = PLAIN) -> Prior:
+def _prior(size: tuple[int, int], focal_35mm: float | None, focal_sigma: float, lens: Lens) -> Prior:
     focal = focal_in_pixels(focal_35mm, *size)
     centre_sigma = CENTRE_SIGMA * max(size)
     mean = np.zeros(lens.n_numbers())

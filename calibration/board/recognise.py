@@ -75,7 +75,8 @@ def _guess_charuco(photos: Sequence[Grey]) -> Board | None:
         for columns, ratio, _, _ in sorted(layouts, key=lambda one: -one.n_markers)[:2]:
             top = max(one.top for one in layouts if one.columns == columns)
             board = _charuco(columns, top, ratio, family)
-            n_corners = _n_corners(board, small)
+            found = [corners for photo in small if (corners := find_board(photo, board)) is not None]
+            n_corners = sum(len(corners.points) for corners in found if corners.board == board)
             if n_corners and (best is None or n_corners > best[0]):
                 best = n_corners, board
         if best and max((one.n_markers for one in layouts), default=0) >= SURE_MARKERS:
@@ -130,12 +131,6 @@ def _charuco(columns: int, top: int, ratio: float, family: tuple[str, ...]) -> B
         rows += 1
     dictionary = next((d for d in family if len(opencv_dictionary(d).bytesList) > top), family[-1])
     return Board("charuco", columns, rows, ASSUMED_SQUARE_MM, round(ratio * ASSUMED_SQUARE_MM, 1), dictionary)
-
-
-def _n_corners(board: Board, photos: Sequence[Grey]) -> int:
-    """Count the corners of this board that are seen, over all photos."""
-    found = [corners for photo in photos if (corners := find_board(photo, board)) is not None]
-    return sum(len(corners.points) for corners in found if corners.board == board)
 
 
 # --- checkerboard ----------------------------------------------------------------------------------------------------

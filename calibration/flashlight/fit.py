@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_array
 
 from calibration.flashlight.beam_profile import EXTRA_TERMS
 from calibration.flashlight.descent import RobustWeights, refine
@@ -19,6 +20,7 @@ from calibration.flashlight.model import (
     cost,
     free_tangent,
     log_irradiance,
+    normal_equations,
 )
 from calibration.ground.table_edges import TableEdge, on_table
 from calibration.lights import hand
@@ -105,15 +107,25 @@ class FlashlightFit:
         """Return the log residuals of all samples."""
         return cell_residuals(self.flashlights, self.evidence, self.weight)
 
+    def variance(self, trust: float = 1.0) -> Float[np.ndarray, "photos 3"]:
+        """Return the variance of the positions, world: of the fit, with priors, and between fits about as likely.
+
+        Args:
+            trust: factor of the weight of all samples.
+        """
+        matrix, _ = normal_equations(self.flashlights, self.evidence, trust * self.weight, self.priors)
+        basis = csr_array(self.tangent(self.flashlights))
+        covariance = basis @ np.linalg.pinv(basis.T @ matrix @ basis, hermitian=True) @ basis.T
+        n, own = len(self.flashlights.positions), self.flashlights.per_flashlight()
+        return np.maximum(np.diag(covariance)[: own * n].reshape(n, own)[:, :3], 0) + self.between
+
     def ground(self) -> int:
         """Return how many cells follow the light in some photo."""
         return int((self.weight.sum(0) > 0).sum())
 
 
 def collect(
-    stack: PhotoStack,
-    posed_camera: PosedCamera,
-    usable: Bool[np.ndarray, " photos"],
+    stack: PhotoStack, posed_camera: PosedCamera, usable: Bool[np.ndarray, " photos"]
 ) -> tuple[Evidence, Int[np.ndarray, " used"]]:
     """Return the evidence of the usable photos, and their indices in the stack.
 

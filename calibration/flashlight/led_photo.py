@@ -282,11 +282,8 @@ def _circles(view: UInt8[np.ndarray, "side side"], roundness: float) -> Float[np
 def _is_lens(view: UInt8[np.ndarray, "side side"], circle: Circle, led_mm: float) -> bool:
     """Return whether a circle is near the LED, in the middle of the view, and dark, and neither window nor glare."""
     apart = float(np.linalg.norm(circle[:2] / DOTS_PER_MM - REACH_MM))
-    return max(led_mm / 2, float(circle[2]) / DOTS_PER_MM) <= apart <= REACH_MM and _is_dark(view, circle)
-
-
-def _is_dark(view: UInt8[np.ndarray, "side side"], circle: Circle) -> bool:
-    """Return whether the middle of a circle is darker than its surroundings, as a lens is."""
+    if not max(led_mm / 2, float(circle[2]) / DOTS_PER_MM) <= apart <= REACH_MM:
+        return False
     y, x = np.ogrid[: view.shape[0], : view.shape[1]]
     radius = np.hypot(x - circle[0], y - circle[1]) / circle[2]
     inside, around = view[radius < 0.5], view[(radius > 0.9) & (radius < 1.4)]
@@ -304,12 +301,11 @@ def _merged(circles: list[Circle]) -> list[tuple[float, float]]:
                 break
         else:
             places.append([circle])
-    middles = [np.mean([c[:2] for c in group if _is_central(c, group[0])], axis=0) for group in places]
+    middles = []
+    for group in places:
+        apart = np.linalg.norm(np.array(group)[:, :2] - group[0][:2], axis=1)
+        middles.append(np.array(group)[apart < ONE_LENS_MM * DOTS_PER_MM, :2].mean(0))
     return [(float(x), float(y)) for x, y in middles]
-
-
-def _is_central(circle: Circle, largest: Circle) -> bool:
-    return bool(np.linalg.norm(circle[:2] - largest[:2]) < ONE_LENS_MM * DOTS_PER_MM)
 
 
 def _reading(lens: tuple[float, float], led: tuple[float, float], led_mm: float, above: PosedCamera) -> LensReading:

@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.sparse import csr_array
 
 from calibration.flashlight.beam_profile import without_splines
 from calibration.flashlight.descent import refine
@@ -44,16 +43,9 @@ from calibration.flashlight.fit import (
     with_oval_beams,
     without_gloss,
 )
-from calibration.flashlight.model import (
-    NOISE,
-    Flashlights,
-    cosines,
-    free_tangent,
-    normal_equations,
-)
+from calibration.flashlight.model import NOISE, cosines, free_tangent
 from calibration.flashlight.outline_lights import OUTLINE_SIDE, outline_sigma, with_outlines
 from calibration.flashlight.pictured import as_pictured, with_response
-from calibration.flashlight.wall import WALL_TERMS
 from calibration.light import Light, Vector
 from calibration.lights import hand
 from calibration.lights.ground_cells import ground_ends
@@ -143,24 +135,18 @@ def describe(
 def _colour(fit: FlashlightFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:
     """Power per photo and channel, and ambient irradiance: the grey fit repeated per channel with fixed geometry."""
     cells = fit.evidence.cells
-    held = _powers_only(fit.flashlights)
+    n, own, terms = len(fit.flashlights.positions), fit.flashlights.per_flashlight(), len(fit.flashlights.beam)
+    vary = [*(own * k + 6 for k in range(n)), own * n + terms]  # powers and ambient light
+    held = np.eye(own * n + fit.flashlights.shared())[:, vary]
     powers, ambients = [], []
     for channel in range(3):
         evidence = replace(fit.evidence, log_grey=np.log(np.maximum(cells.rgb[..., channel], 1e-9)))
         flashlights = refine(fit.flashlights, evidence, LOOSE_POWER, lambda _: held, COLOUR_STEPS)[0]
-        shift = np.mean(
-            flashlights.log_power - fit.flashlights.log_power
-        )  # into albedo: the session's flashlight is white
+        # into albedo: the session's flashlight is white
+        shift = np.mean(flashlights.log_power - fit.flashlights.log_power)
         powers.append(np.exp(flashlights.log_power - shift))
         ambients.append(flashlights.ambient * np.exp(-shift))
     return np.stack(powers, -1) * hand.USUAL**2, np.array(ambients)
-
-
-def _powers_only(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
-    """Return the tangent that varies only powers and ambient light."""
-    n, own, terms = len(flashlights.positions), flashlights.per_flashlight(), len(flashlights.beam)
-    columns = [*(own * k + 6 for k in range(n)), own * n + terms]
-    return np.eye(own * n + terms + 4 + WALL_TERMS)[:, columns]
 
 
 def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: list[str]) -> list[str]:
@@ -248,19 +234,12 @@ def surely_placed(found: LightFit, centre: Float[np.ndarray, "3"]) -> float:
 def position_sigma(fit: FlashlightFit) -> Float[np.ndarray, "photos 3"]:
     """Return one sigma per coordinate of the positions, world: of the fit itself, and between fits from other starts.
 
-    The inverse of the normal matrix with priors, its samples weighted by the residuals' spread and by how many cells
-    err together [Kish, Survey Sampling (1965), section 5.4].
+    Samples are weighted by the residuals' spread and by how many cells err together [Kish, Survey Sampling (1965),
+    section 5.4].
     """
-    n, own = len(fit.flashlights.positions), fit.flashlights.per_flashlight()
     known = fit.weight > 0
     noise = max(spread((np.sqrt(fit.evidence.weight) * fit.residual())[known]), NOISE)
-    trust = 1 / (noise**2 * alike(fit.weight))
-    evidence = replace(fit.evidence, weight=trust * fit.evidence.weight)
-    matrix, _ = normal_equations(fit.flashlights, evidence, trust * fit.weight, fit.priors)
-    basis = csr_array(fit.tangent(fit.flashlights))
-    covariance = basis @ np.linalg.pinv(basis.T @ matrix @ basis, hermitian=True) @ basis.T
-    variance = np.diag(covariance)[: own * n].reshape(n, own)[:, :3]
-    return np.sqrt(np.maximum(variance, 0) + fit.between)
+    return np.sqrt(fit.variance(1 / (noise**2 * alike(fit.weight))))
 
 
 def unseen_error(fit: FlashlightFit) -> Float[np.ndarray, " photos"]:

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
 from calibration.flashlight.beam_profile import SMOOTH_TERMS, derivatives
@@ -54,9 +55,8 @@ class Flashlights:
     ambient: float
     aim: Float[np.ndarray, "3"]  # where the person aims on average
     wall: Wall = field(default_factory=lambda: NO_WALL)
-    response: Float[np.ndarray, " responses"] = field(
-        default_factory=lambda: np.zeros(0)
-    )  # of the pictures; none: linear
+    # of the pictures; none: linear
+    response: Float[np.ndarray, " responses"] = field(default_factory=lambda: np.zeros(0))
     oval: Float[np.ndarray, "photos 2"] | None = None  # log gain at OVAL_ANGLE by cos 2 phi, sin 2 phi; None: round
     _modelled: list[tuple[GroundCells, float, tuple]] = field(default_factory=list, init=False, repr=False)
 
@@ -284,9 +284,8 @@ def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
     width = priors.aim
     rows = np.arange(n)
     for offset, basis in ((0, first), (n, second)):
-        for x in range(3):
-            jac[offset + rows, own * rows + 3 + x] = basis[:, x] / width
-            jac[offset + rows, full - 3 + x] = -basis[:, x] / width
+        jac[offset + rows[:, None], own * rows[:, None] + [3, 4, 5]] = basis / width
+        jac[offset + rows, -3:] = -basis / width
     own_power = flashlights.log_power - priors.usual
     bent = 1 + (own_power / priors.power_outlier) ** 2
     jac[2 * n + rows, own * rows + 6] = bent**-1.5 / priors.log_power
@@ -327,18 +326,9 @@ def free_tangent(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
 
     The shared parameters are beam, ambient, wall, response and mean aim.
     """
-    n, own = len(flashlights.positions), flashlights.per_flashlight()
-    rest = flashlights.shared()
-    free = own - 1
-    out = np.zeros((own * n + rest, free * n + rest))
-    first, second = across(flashlights.axes())
-    for k in range(n):
-        row, column = own * k, free * k
-        out[row : row + 3, column : column + 3] = np.eye(3)
-        out[row + 3 : row + 6, column + 3], out[row + 3 : row + 6, column + 4] = first[k], second[k]
-        out[row + 6 : row + own, column + 5 : column + free] = np.eye(own - 6)
-    out[own * n :, free * n :] = np.eye(rest)
-    return out
+    beams, rest = np.stack(across(flashlights.axes()), -1), np.eye(flashlights.per_flashlight() - 6)
+    own = (block for beam in beams for block in (np.eye(3), beam, rest))
+    return np.asarray(block_diag(*own, np.eye(flashlights.shared())))
 
 
 def pulled(jacobian: tuple[np.ndarray, np.ndarray], weighted: Samples) -> Float[np.ndarray, " full"]:

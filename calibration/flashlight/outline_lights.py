@@ -14,18 +14,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from calibration.flashlight.fit import (
-    MIN_GROUND,
-    FlashlightFit,
-    does_not_follow,
-    thinned,
-)
+from calibration.flashlight.fit import MIN_GROUND, FlashlightFit, does_not_follow, thinned
 from calibration.flashlight.joint_search import searched, settled
-from calibration.flashlight.model import (
-    Evidence,
-    Flashlights,
-    normal_equations,
-)
+from calibration.flashlight.model import Evidence, Flashlights
 from calibration.flashlight.pictured import bent
 from calibration.ground.ground_field import GroundField, at_photo_size
 from calibration.ground.ground_shadows import GroundShadows, find_shadows, of_one_ground
@@ -161,10 +152,5 @@ def outline_sigma(fit: FlashlightFit) -> Float[np.ndarray, "photos 3"]:
 
     The variance is that of a mixture: of the fit itself, and between the fits that explain the photos about as well.
     """
-    matrix, _ = normal_equations(fit.flashlights, fit.evidence, fit.weight, fit.priors)
-    basis = fit.tangent(fit.flashlights)
-    covariance = basis @ np.linalg.pinv(basis.T @ matrix @ basis, hermitian=True) @ basis.T
-    n, own = len(fit.flashlights.positions), fit.flashlights.per_flashlight()
-    variance = np.diag(covariance)[: own * n].reshape(n, own)[:, :3]
     reach = np.linalg.norm(fit.flashlights.positions - fit.evidence.cells.centre, axis=1, keepdims=True)
-    return np.sqrt(np.maximum(variance, 0) + (ROUNDED * reach) ** 2 / 3 + fit.between)
+    return np.sqrt(fit.variance() + (ROUNDED * reach) ** 2 / 3)

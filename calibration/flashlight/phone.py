@@ -24,7 +24,7 @@ from calibration.flashlight.model import Flashlights, free_tangent
 from calibration.flashlight.outline_lights import outlines_of
 from calibration.flashlight.pictured import with_response
 from calibration.ground.table_edges import TableEdge
-from calibration.lights.fusion import disagree, fuse
+from calibration.lights.fusion import fuse
 from calibration.lights.ground_cells import ground_ends
 from calibration.outlines.carried_light import offset_by_outlines
 from calibration.outlines.terms import DROP_OUTLINE
@@ -73,10 +73,7 @@ class _Carried:
 
 
 def locate_lights_from_phone(
-    stack: PhotoStack,
-    posed_camera: PosedCamera,
-    usable: Bool[np.ndarray, " photos"],
-    views: PhoneViews,
+    stack: PhotoStack, posed_camera: PosedCamera, usable: Bool[np.ndarray, " photos"], views: PhoneViews
 ) -> LightFit:
     """Return one point light per usable photo: the phone's pose from the board plus the LED's offset from its lens.
 
@@ -148,11 +145,7 @@ def _shown_by_outlines(
 
 
 def _fit(
-    carried: _Carried,
-    alone: FlashlightFit,
-    views: PhoneViews,
-    lens_error_mm: float,
-    shown: _Offset | None,
+    carried: _Carried, alone: FlashlightFit, views: PhoneViews, lens_error_mm: float, shown: _Offset | None
 ) -> tuple[FlashlightFit, float, Choice | None]:
     """Fit with the LED's offset given, fitted, or read from the phone's back; return also its error, mm, and choice.
 
@@ -196,7 +189,7 @@ def _is_surer(shown: _Offset, shaded: Float[np.ndarray, "3"], error_mm: float) -
         error_mm: of the offset that shading gives.
     """
     spread = np.diag(np.full(3, FITTED_SIGMA**2))
-    return np.trace(shown[1]) < error_mm**2 or disagree(fuse([shaded, shown[0]], [spread, shown[1]])[2])
+    return np.trace(shown[1]) < error_mm**2 or fuse([shaded, shown[0]], [spread, shown[1]])[2]
 
 
 def led_is_beside(offset: Float[np.ndarray, "3"]) -> bool:

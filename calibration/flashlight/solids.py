@@ -15,7 +15,7 @@ from calibration.flashlight.solid_shadows import (
     search_direction,
 )
 from calibration.light import Light, irradiance
-from calibration.lights.fusion import disagree, fuse
+from calibration.lights.fusion import fuse
 from calibration.lights.ground_cells import ground_points
 from calibration.lights.power import with_power_per_photo
 from calibration.posed_camera import PosedCamera
@@ -49,9 +49,9 @@ def fuse_shadow_lights(
             lights.append(light)
             continue
         place = found.light[:3] + ground
-        mean, covariance, ratio = fuse([at, place], [np.diag(light.sigma**2), found.covariance])
+        mean, covariance, contradict = fuse([at, place], [np.diag(light.sigma**2), found.covariance])
         reason = light.reason
-        if disagree(ratio):
+        if contradict:
             by = float(np.linalg.norm(at - place))
             reason = f"shading and the shadows of the declared objects place it {by:.0f} mm apart"
             apart.append(light.photo)
@@ -77,7 +77,9 @@ def locate_sun(
             "declare a [[pegs]] or [[cubes]] that stands on the table",
             Remedy.LIGHTS_FILE,
         )
-    pixels = _around(stack, posed_camera, solids, _even_levels(stack))
+    grey = np.where(stack.clipped, np.nan, mean_of_channels(stack.rgb))
+    even = grey / np.nanmedian(grey, axis=(1, 2), keepdims=True)  # a sun lights level ground evenly
+    pixels = _around(stack, posed_camera, solids, even)
     lights = []
     for k in np.flatnonzero(usable):
         start = search_direction(pixels, int(k), solids)
@@ -157,9 +159,3 @@ def _flash_levels(
             value = mean_of_channels(stack.rgb[k]) / np.maximum(sent, 1e-12)
             out[k] = np.where(down & ~stack.clipped[k], value, np.nan)
     return out
-
-
-def _even_levels(stack: PhotoStack) -> Float[np.ndarray, "photos height width"]:
-    """Return grey value over each photo's median: a sun lights level ground evenly."""
-    grey = np.where(stack.clipped, np.nan, mean_of_channels(stack.rgb))
-    return grey / np.nanmedian(grey, axis=(1, 2), keepdims=True)

@@ -9,26 +9,25 @@ RESOLUTION = 1000  # integer units per unit of cost: the flow is exact in intege
 
 
 def cheapest_region(
-    cost_in: Float[np.ndarray, "height width"],
-    cost_out: Float[np.ndarray, "height width"],
+    gain: Float[np.ndarray, "height width"],
     across_columns: Float[np.ndarray, "height width_less_1"],
     across_rows: Float[np.ndarray, "height_less_1 width"],
 ) -> Bool[np.ndarray, "height width"]:
-    """Find the region of least cost: inside costs of its pixels, outside costs of the others, and costs of cut links.
+    """Find the region whose pixels gain most, less the costs of the links that its outline cuts.
 
     Solved exactly as a minimum cut (Greig, Porteous and Seheult 1989), by scipy's maximum flow.
 
     Args:
+        gain: of a pixel in the region over the same outside it, as log odds.
         across_columns, across_rows: cost of a link between neighbours in a row, and in a column.
     """
-    height, width = cost_in.shape
+    height, width = gain.shape
     count = height * width
     source, sink = count, count + 1
     place = np.arange(count).reshape(height, width)
-    gain = (cost_out - cost_in).ravel()
     links = [
-        (np.full(count, source), place.ravel(), np.maximum(gain, 0)),
-        (place.ravel(), np.full(count, sink), np.maximum(-gain, 0)),
+        (np.full(count, source), place.ravel(), np.maximum(gain, 0).ravel()),
+        (place.ravel(), np.full(count, sink), np.maximum(-gain, 0).ravel()),
     ]
     for first, second, cost in (
         (place[:, :-1], place[:, 1:], across_columns),
@@ -36,7 +35,7 @@ def cheapest_region(
     ):
         links += [(first.ravel(), second.ravel(), cost.ravel()), (second.ravel(), first.ravel(), cost.ravel())]
     start, end, cost = (np.concatenate(x) for x in zip(*links, strict=True))
-    capacity = np.rint(cost * RESOLUTION).astype(np.int32)
+    capacity = np.rint(cost.astype(float) * RESOLUTION).astype(np.int32)
     some = capacity > 0
     graph = csr_matrix((capacity[some], (start[some], end[some])), shape=(count + 2, count + 2))
     left = graph - maximum_flow(graph, source, sink).flow

@@ -101,17 +101,13 @@ def _brightest_spot(
     if not (_rim(core) & np.pad(np.zeros_like(core), 1, constant_values=True)).any():
         for part, share in zip(parts, cut, strict=True):
             if share < (WHOLE + hidden if part is parts[0] else WHOLE):
-                return _Spot(_centroid(np.where(part, np.maximum(excess, 0), 0)), height, hidden)
+                bright = part & (excess > 0)
+                return _Spot(np.average(np.argwhere(bright), axis=0, weights=excess[bright]), height, hidden)
     elif cut[-1] < CUT:
         middle = _ellipse_middle(_rim(core) & np.pad(valid, 1))
         if all(0 <= one <= last - 1 for one, last in zip(middle, valid.shape, strict=True)):
             return _Spot(middle, height, max(hidden, cut[-1]))
     return None
-
-
-def _centroid(weight: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "2"]:
-    places = np.argwhere(weight > 0)
-    return np.average(places, axis=0, weights=weight[weight > 0])
 
 
 def _ellipse_middle(rim: Bool[np.ndarray, "height_and_2 width_and_2"]) -> Float[np.ndarray, "2"]:

@@ -42,6 +42,7 @@ STRANGE = 0.02  # share of either that looks like nothing else of it
 AWAY = (1.0, 0.5, 0.25, 0.1, 0.0)  # of what is found: the object's other parts lie nearer; the first that leaves ENOUGH
 ENOUGH = 0.2  # of the picture, of ground that tells its look
 AROUND = 0.6  # of the root of the object's area: sigma of the window whose ground tells the albedo in a gap
+WINDOW = 6, 1e-9  # px per sigma; one pixel that tells is enough
 LINK = 8.0  # nats: cost of a cut between alike neighbours
 EDGE = 3.0  # times the usual difference of neighbours: where a cut costs .6 of that
 SURE = 20.0  # nats: more is not believed
@@ -83,7 +84,7 @@ def object_and_ground(
     told = count >= FEWEST_PHOTOS
     by_light, links = np.where(told, np.clip(worth * mean, -SURE, SURE), 0), _links(field)
     odds, albedo = by_light, field.albedo
-    region = _cut(odds, links)
+    region = cheapest_region(odds, *links)
     for _ in range(ROUNDS):
         thing = shadowed_inside(field, region)
         if not thing.any():
@@ -96,7 +97,7 @@ def object_and_ground(
         in_gap = np.where(told, np.clip(in_gap + shown - by_light + said / 2, -SURE, SURE), SURE)
         beside = shown + samples.look_odds(region, thing) + said
         before, either = region, np.minimum(beside, in_gap)
-        if not (after := _cut(either, links)).any():  # a gap lies beside an object: not all of it is one
+        if not (after := cheapest_region(either, *links)).any():  # a gap lies beside an object: not all of it is one
             break
         shaded = ((field.residual + field.albedo - near[..., 0] < DARK) & usable).sum(0) >= count / 2
         odds, region = either, after
@@ -196,7 +197,7 @@ class _Samples:
             step = cv2.GaussianBlur(np.where(seen, one, 0).astype(np.float32), (0, 0), POOLED) / np.maximum(weight, 0.1)
             shown = seen & (weight > 0.5)
             bare = shown & self.follows & ~thing
-            missed = np.sqrt(_window_mean(step**2, bare, 2 * float(thing.sum()) ** 0.5))
+            missed = np.sqrt(window_mean(step**2, bare, 2 * float(thing.sum()) ** 0.5, *WINDOW))
             missed = np.maximum(missed, max(spread(step[bare]), NARROWEST / POOLED))
             gain = step**2 / 2 * (1 / missed**2 - 1 / STEP**2) - np.log(STEP / missed)
             total += np.clip(gain, -ODDS, ODDS) * shown
@@ -207,8 +208,8 @@ class _Samples:
         """Return log albedo and colours of the bare ground around each pixel, and how they scatter."""
         bare = self.follows & ~(cv2.dilate(region.astype(np.uint8), RIM) > 0)
         told, sigma = np.dstack([self.field.albedo, self.ground]), AROUND * float(thing.sum()) ** 0.5
-        near = _window_mean(told, bare, sigma)
-        return near, np.sqrt(_window_mean((told - near) ** 2, bare, sigma))
+        near = window_mean(told, bare, sigma, *WINDOW)
+        return near, np.sqrt(window_mean((told - near) ** 2, bare, sigma, *WINDOW))
 
     def gap_odds(self, near: Look, scatter: Look, thing: Region) -> Maps:
         """Return log odds of object over ground in a gap, sample by sample.
@@ -290,11 +291,7 @@ def _links(field: GroundField) -> list[np.ndarray]:
     log = np.maximum(np.stack([green + colour[..., 0], green, green + colour[..., 1]], -1), np.log(DARKEST))
     steps = [np.median(np.abs(np.diff(log, axis=axis)).mean(-1), 0) for axis in (2, 1)]
     usual = max(float(np.median(np.concatenate([step.ravel() for step in steps]))), 1e-6)
-    return [LINK * np.exp(-((step / (EDGE * usual)) ** 2) / 2).astype(float) for step in steps]
-
-
-def _cut(odds: Map, links: list[np.ndarray]) -> Region:
-    return cheapest_region(np.maximum(-odds, 0).astype(float), np.maximum(odds, 0).astype(float), *links)
+    return [LINK * np.exp(-((step / (EDGE * usual)) ** 2) / 2) for step in steps]
 
 
 def _away(thing: Region, region: Region) -> Region:
@@ -304,14 +301,21 @@ def _away(thing: Region, region: Region) -> Region:
     return next((one for one in found if one.sum() > ENOUGH * one.size), ~region)
 
 
-def _window_mean(values: Float[np.ndarray, "height width *kinds"], where: Region, sigma: float) -> np.ndarray:
-    """Return the mean over a Gaussian window of the pixels in `where`, at the resolution that it leaves."""
-    height, width = where.shape
-    weight, shrink = where.astype(np.float32)[..., None], max(1.0, sigma / 6)
-    size = (max(4, round(width / shrink)), max(4, round(height / shrink)))
-    parts = np.dstack([values.reshape(height, width, -1) * weight, weight]).astype(np.float32)
-    sums = cv2.GaussianBlur(cv2.resize(parts, size, interpolation=cv2.INTER_AREA), (0, 0), sigma / shrink)
-    return cv2.resize(sums[..., :-1] / np.maximum(sums[..., -1:], 1e-9), (width, height)).reshape(values.shape)
+def window_mean(
+    values: Float[np.ndarray, "height width *kinds"], weight: np.ndarray, sigma: float, finest: float, fewest: float
+) -> Float[np.ndarray, "height width *kinds"]:
+    """Return the weighted mean over a Gaussian window, at the resolution that it leaves: normalized convolution.
+
+    Args:
+        finest: pixels per sigma of the smaller picture in which the window is laid.
+        fewest: mean weight in a window below which the mean goes towards 0.
+    """
+    height, width = weight.shape
+    votes, step = weight.astype(np.float32)[..., None], max(1.0, sigma / finest)
+    size = (max(4, round(width / step)), max(4, round(height / step)))
+    parts = np.dstack([values.reshape(height, width, -1) * votes, votes]).astype(np.float32)
+    sums = cv2.GaussianBlur(cv2.resize(parts, size, interpolation=cv2.INTER_AREA), (0, 0), sigma / step)
+    return cv2.resize(sums[..., :-1] / np.maximum(sums[..., -1:], fewest), (width, height)).reshape(values.shape)
 
 
 def _histogram(cells: np.ndarray) -> np.ndarray:

@@ -34,6 +34,9 @@ from capture.errors import CalibrationError
 from capture.files.schema import EXPORT, LARGEST_FILE, MOST_ENTRIES, Power, Text, as_type, read_json, read_text, refused
 from capture.files.schema import Vector as Numbers
 
+READERS = {"light_pos": s3nerf_rows, "frames": shadowneus_rows}  # of JSON without names, by an entry that it has
+READERS |= dict.fromkeys(("directions", "positions3d", "positions"), dome_rows)
+
 
 class NoMatchError(CalibrationError):
     """A file of lights can be read, but not all photos are in it."""
@@ -75,12 +78,9 @@ def read_lights(path: Path, photos: Sequence[str], posed_camera: PosedCamera, ev
         return _own(path, photos)
     if "lights" in content:
         return _listed(content, photos, path)
-    if "light_pos" in content:
-        return _matched(s3nerf_rows(content, path, posed_camera), photos, path, every)
-    if "frames" in content:
-        return _matched(shadowneus_rows(content, path, posed_camera), photos, path, every)
-    if "directions" in content or "positions3d" in content or "positions" in content:
-        return _matched(dome_rows(content, path, posed_camera), photos, path, every)
+    rows_of = next((READERS[entry] for entry in READERS if entry in content), None)
+    if rows_of is not None:
+        return _matched(rows_of(content, path, posed_camera), photos, path, every)
     raise CalibrationError(
         f"{path} is of no known kind (its entries: {', '.join(list(content)[:6]) or 'none'}). {READABLE}."
     )
@@ -121,8 +121,7 @@ def read_opinions(path: Path) -> tuple[Light, ...] | None:
 
 def _own(path: Path, photos: Sequence[str]) -> GivenLights:
     given = load_calibration(path.resolve())  # a link that a person names is followed
-    lights = _by_name(given.lights, [light.photo for light in given.lights], photos, path)
-    return GivenLights(lights, True, given.beam, given.ambient)
+    return GivenLights(_by_name(given.lights, photos, path), True, given.beam, given.ambient)
 
 
 class _Entry(Struct):
@@ -153,16 +152,15 @@ class _List(Struct):
 
 def _listed(content: Any, photos: Sequence[str], path: Path) -> GivenLights:
     listed = as_type(content, _List, str(path), EXPORT).lights
-    lights = [one.light() for one in listed]
     has_power = bool(listed) and all(one.power for one in listed)
-    return GivenLights(_by_name(lights, [light.photo for light in lights], photos, path), has_power)
+    return GivenLights(_by_name([one.light() for one in listed], photos, path), has_power)
 
 
-def _by_name(lights: Sequence[Light], names: Sequence[str], photos: Sequence[str], path: Path) -> tuple[Light, ...]:
+def _by_name(lights: Sequence[Light], photos: Sequence[str], path: Path) -> tuple[Light, ...]:
     """Return the lights of each photo, matched by whole name or else by the name without its ending."""
     by_name: dict[str, list[Light]] = {}
-    for name, light in zip(names, lights, strict=True):  # several with one name: their photo shows the sum of them
-        by_name.setdefault(bare(name), []).append(light)
+    for light in lights:  # several with one name: their photo shows the sum of them
+        by_name.setdefault(bare(light.photo), []).append(light)
     missing = [photo for photo in photos if bare(photo) not in by_name]
     if missing:
         raise NoMatchError(
@@ -176,11 +174,10 @@ def _matched(rows: Rows, photos: Sequence[str], path: Path, every: Sequence[str]
     """Match rows as lights to photos: by name, else by order, else by number."""
     known, every = {bare(photo) for photo in photos}, list(every or photos)
     is_named = all(name is not None for name in rows.names) and known <= {bare(n) for n in rows.names if n}
-    lights = list(rows.lights())
+    lights = rows.lights()
     notes, is_by_number = [rows.note] if rows.note else [], False
     if is_named:
-        found = _by_name(lights, [n or "" for n in rows.names], photos, path)
-        return GivenLights(found, False, notes=tuple(notes), unit=rows.unit)
+        return GivenLights(_by_name(lights, photos, path), False, notes=tuple(notes), unit=rows.unit)
     if len(lights) == len(every):
         order = [every.index(photo) for photo in photos]
         notes.append(f"lights: {path.name} matched to the photos by order, not by name")

@@ -17,10 +17,8 @@ from capture.photos.photo import PhotoStack
 RADIUS = hand.USUAL
 CELL = 0.026  # of the distance from the camera to the ground in the middle of the photo: some 15 px wide
 MIN_PIXELS = 6  # fewer pixels in a cell than this leave its mean noisy
-MAX_SAMPLES, ENOUGH_CELLS = (
-    60_000,
-    400,
-)  # photos times cells: 40 photos keep all cells; with many photos, fewer cells suffice
+MAX_SAMPLES = 60_000  # photos times cells: 40 photos keep all cells
+ENOUGH_CELLS = 400  # with many photos, fewer cells suffice
 MIN_CELLS = 150  # below this, position, aim and beam cannot be separated
 THIN_STRIDE = 7  # between rows: kept cells form no stripes, for every step below
 STEEPEST_VIEW = 0.03  # ground seen at less than this cosine is a smear along the horizon
@@ -78,25 +76,17 @@ def field_of(
     return fit_ground_field(stack.rgb[usable], ~stack.clipped[usable], beyond)
 
 
-def _cell_of_pixel(
-    points: Float[np.ndarray, "pixels 3"], centre: Float[np.ndarray, "3"], scale: float
-) -> Int[np.ndarray, " pixels"]:
-    """Return the index of the cell that contains each point."""
-    index = np.floor((points[:, :2] - centre[:2]) / (CELL * scale)).astype(int)
-    index -= index.min(0)
+def _numbers(index: Int[np.ndarray, "pixels 2"]) -> Int[np.ndarray, " pixels"]:
+    """Return one number for each cell of a grid, of the cell's two."""
+    index = index - index.min(0)
     return index[:, 0] * (index[:, 1].max() + 1) + index[:, 1]
 
 
-def _thinned(points, near: Bool[np.ndarray, "height width"], centre, scale: float, n_photos: int):
-    """Return which pixels of the kept cells to use: all, or for many photos one of every few, evenly spread."""
-    side = CELL * scale
-    wanted = max(MAX_SAMPLES / n_photos, ENOUGH_CELLS)
-    index = np.floor((points[..., :2] - centre[:2]) / side).astype(np.int64)
-    kept = index[near].T
-    width = int(np.ptp(kept[1])) + 1 if kept.size else 1
-    there = len(np.unique(kept[0] * width + kept[1]))  # one number for each cell, as none spans more than the width
-    step = max(int(there // wanted), 1)
-    return (index[..., 0] * THIN_STRIDE + index[..., 1]) % step == 0
+def _thinned(index: Int[np.ndarray, "pixels 2"], n_photos: int) -> Bool[np.ndarray, " pixels"]:
+    """Return which pixels to use: of all cells, or for many photos of one of every few, evenly spread."""
+    there = len(np.unique(_numbers(index)))
+    step = max(int(there // max(MAX_SAMPLES / n_photos, ENOUGH_CELLS)), 1)
+    return (index[:, 0] * THIN_STRIDE + index[:, 1]) % step == 0
 
 
 def sample_ground(stack: PhotoStack, posed_camera: PosedCamera, photos: Int[np.ndarray, " photos"]) -> GroundCells:
@@ -119,9 +109,10 @@ def sample_ground(stack: PhotoStack, posed_camera: PosedCamera, photos: Int[np.n
     centre = points[middle]
     scale = float(np.linalg.norm(centre - eye))
     near = down & (np.linalg.norm(points - centre, axis=-1) < RADIUS)
-    near &= _thinned(points, near, centre, scale, len(photos))
-    seen = points[near]
-    cell = _cell_of_pixel(seen, centre, scale)
+    index = np.floor((points[near][:, :2] - centre[:2]) / (CELL * scale)).astype(np.int64)
+    chosen = _thinned(index, len(photos))
+    near[near] = chosen
+    seen, cell = points[near], _numbers(index[chosen])
     order = np.argsort(cell, kind="stable")
     _, first, count = np.unique(cell[order], return_index=True, return_counts=True)
     full = count >= MIN_PIXELS

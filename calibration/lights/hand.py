@@ -12,7 +12,5 @@ NEAREST, FARTHEST = 200.0, 1500.0
 USUAL = float(np.sqrt(NEAREST * FARTHEST))  # the middle of that range, in logarithms
 DISTANCES = tuple(np.geomspace(NEAREST, FARTHEST, 7))  # of a search: 1.4 times as far each, as its places lie aside
 LOWEST = 40.0  # above the table: half the width of a phone or of a hand around a torch
-AIM, AIM_MEAN = (
-    180.0,
-    300.0,
-)  # one sigma: a beam beside where all aim, 20 degrees at USUAL; all beside the photo's middle
+AIM = 180.0  # one sigma of a beam beside where all aim: 20 degrees at USUAL
+AIM_MEAN = 300.0  # one sigma of where all aim, beside the photo's middle

@@ -47,10 +47,11 @@ class Rows:
     unit: str = ""  # of places, where the file names one
 
     def lights(self) -> tuple[Light, ...]:
-        """Return the light of each row, without a photo."""
+        """Return the light of each row, its photo as the file names it."""
+        pairs = [(name or "", value) for name, value in zip(self.names, self.values, strict=True)]
         if self.kind == "point":
-            return tuple(Light("", "point", position=value) for value in self.values)
-        return tuple(Light("", "directional", direction=value / np.linalg.norm(value)) for value in self.values)
+            return tuple(Light(name, "point", position=value) for name, value in pairs)
+        return tuple(Light(name, "directional", direction=value / np.linalg.norm(value)) for name, value in pairs)
 
 
 # --- over the picture ------------------------------------------------------------------------------------------------

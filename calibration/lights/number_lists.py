@@ -37,7 +37,7 @@ NEEDED = "a name and x y z of its light are needed"
 
 
 def number_rows(path: Path, posed_camera: PosedCamera) -> Rows:
-    """Read a list by its ending.
+    """Read a list by its ending: arrays, RTI's .lp, and tables (.csv), whose head may name angles or places.
 
     Raises:
         CalibrationError: the file cannot be read, or a line is no light; names it and what can be read.
@@ -49,15 +49,6 @@ def number_rows(path: Path, posed_camera: PosedCamera) -> Rows:
     text = read_text(path)
     if "\0" in text or "\ufffd" in text:
         raise CalibrationError(f"{path} is no text, and of no other kind that gives lights. {READABLE}.")
-    return text_rows(text, path, posed_camera)
-
-
-def text_rows(text: str, path: Path, posed_camera: PosedCamera) -> Rows:
-    """Parse RTI's .lp, DiLiGenT's light_directions.txt and tables (.csv), whose head may name angles or places.
-
-    Raises:
-        CalibrationError: as `named_numbers`.
-    """
     names, vectors, head = named_numbers(text, path)
     if head.kind == "angles":
         vectors, note = head.vectors(vectors, path)
@@ -160,11 +151,8 @@ def _rows(
     why_so = "as its head says" if kind == "point" else ""
     if not kind:
         length = np.linalg.norm(values, axis=1)
-        is_one = length.max() <= SAME_LENGTH * length.min()
-        kind, why_so = (
-            "directional" if is_one else "point",
-            f"since its rows are {length.min():.3g} to {length.max():.3g} long",
-        )
+        kind = "directional" if length.max() <= SAME_LENGTH * length.min() else "point"
+        why_so = f"since its rows are {length.min():.3g} to {length.max():.3g} long"
     vectors = turned(values * UNITS.get(unit, 1.0), posed_camera)
     if kind == "directional":
         return Rows(names, vectors, kind, note=view_note(posed_camera))
@@ -212,13 +200,8 @@ def _mat_rows(path: Path, posed_camera: PosedCamera) -> Rows:
 def _array_rows(values: Float[np.ndarray, "..."], name: str, path: Path, posed_camera: PosedCamera) -> Rows:
     """Return the rows of an array, or its columns where there are three rows."""
     table = values.T if values.ndim == 2 and values.shape[0] == 3 and values.shape[1] != 3 else values
-    if (
-        table.ndim != 2
-        or table.shape[1] != 3
-        or not np.isfinite(table).all()
-        or not table.any(1).all()
-        or not len(table)
-    ):
+    is_list = table.ndim == 2 and table.shape[1] == 3 and len(table)
+    if not is_list or not np.isfinite(table).all() or not table.any(1).all():
         shape = " x ".join(map(str, values.shape)) or "one number"
         raise CalibrationError(
             f"{path}: {name} is {shape}; three finite numbers per light, not all 0, were needed. {READABLE}."

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.optimize import minimize_scalar
 
 from calibration.calibration import Calibration
 from calibration.light import Light, irradiance
-from calibration.lights.ground_cells import GroundCells, sample_ground
+from calibration.lights.ground_cells import sample_ground
 from calibration.posed_camera import PosedCamera
 from capture.checks.robust import column_quantile
 from capture.errors import CalibrationError
@@ -32,9 +33,7 @@ SEARCH_SIDE = 64  # px of the picture in which ground is looked for
 HEIGHTS = 32  # tried at first, evenly in the logarithm of the depth below camera and lights
 DEEPEST = 4.0  # of the distance from the camera to the middle of the lights: the lowest ground that is tried
 SHALLOWEST = 0.02  # of it: the highest
-REFINED = 12  # steps of a golden section about the best height: below a thousandth of it
 FEWEST_GROUND = 0.1  # of the picture's pixels must show ground for its height to be found
-GOLDEN = (np.sqrt(5) - 1) / 2
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,9 @@ def with_power_per_photo(
     photos = np.flatnonzero(usable)
     cells = sample_ground(stack, posed_camera, photos)
     names = [stack.paths[k].name for k in photos]
-    unit = np.stack([_unit_irradiance([x for x in lights if x.photo == name], cells) for name in names])
+    up = np.broadcast_to([0.0, 0.0, 1.0], cells.points.shape)
+    equal = [replace(light, power=np.ones(3)) for light in lights]
+    unit = np.stack([_grey_irradiance([x for x in equal if x.photo == name], cells.points, up, ()) for name in names])
     powers, misfits = [], []
     for channel in range(3):
         bright = np.maximum(cells.rgb[..., channel], 1e-9)
@@ -138,12 +139,6 @@ def with_power_per_photo(
     return PoweredLights(
         tuple(replace(light, power=by_name.get(light.photo, dark)) for light in lights), float(np.mean(misfits))
     )
-
-
-def _unit_irradiance(lights: Sequence[Light], cells: GroundCells) -> Float[np.ndarray, " cells"]:
-    up = np.broadcast_to([0.0, 0.0, 1.0], cells.points.shape)
-    each = [irradiance(cells.points, up, replace(light, power=np.ones(3)))[:, 0] for light in lights]
-    return np.sum(each, axis=0)
 
 
 def _split(ratio: Float[np.ndarray, "photos cells"]):
@@ -220,16 +215,11 @@ def find_ground_height(stack: PhotoStack, calibration: Calibration) -> tuple[flo
     drops = np.geomspace(SHALLOWEST, DEEPEST, HEIGHTS) * max(reach, float(np.linalg.norm(eye)))
     shares = [_ground_share(stack, calibration, top - drop) for drop in drops]
     best = int(np.argmax(shares))
-    low, high = drops[max(best - 1, 0)], drops[min(best + 1, HEIGHTS - 1)]
-    for _ in range(REFINED):
-        a, b = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-        if _ground_share(stack, calibration, top - a) >= _ground_share(stack, calibration, top - b):
-            high = b
-        else:
-            low = a
-    height = top - (low + high) / 2
-    share = _ground_share(stack, calibration, height)
-    return (height, share) if share >= FEWEST_GROUND else None
+    between = drops[max(best - 1, 0)], drops[min(best + 1, HEIGHTS - 1)]
+    found = minimize_scalar(
+        lambda drop: -_ground_share(stack, calibration, top - drop), bounds=between, method="bounded"
+    )
+    return (top - found.x, -found.fun) if -found.fun >= FEWEST_GROUND else None
 
 
 def _ground_share(stack: PhotoStack, calibration: Calibration, height: float) -> float:

@@ -27,6 +27,7 @@ SEEN = 0.8  # of the photos must show a highlight for a circle to be the ball
 ROUND = 0.93  # of the directions from its middle have the strongest edge on the circle: all on a ball
 MOVES = 0.08  # of the radius: standard deviation of the highlights' places
 GROWN = 1.1  # of the radius: what is left out with the ball
+ROUNDS = 3  # of fitting a circle to its edge
 EDGE_PX, CENTROID = 0.5, 0.2  # one sigma: of the circle, px; of a highlight's middle, over its radius
 
 
@@ -54,7 +55,7 @@ def find_ball(stack: PhotoStack) -> Circle | None:
     best, score = None, 0.0
     for picture in (grey.mean(0), grey.max(0), np.median(grey, axis=0)):
         for first in _circles(picture):
-            circle = _refined(grey, first)
+            circle = _refined(grey.mean(0), first)
             found = _score(grey, circle)
             if found > score:
                 best, score = circle, found
@@ -182,10 +183,10 @@ def _edge(picture: Float[np.ndarray, "height width"], circle: Circle) -> tuple[F
     return np.stack([circle.x + found * np.cos(turn), circle.y + found * np.sin(turn)], -1), share
 
 
-def _refined(grey: Float[np.ndarray, "photos height width"], circle: Circle, rounds: int = 3) -> Circle:
+def _refined(mean: Float[np.ndarray, "height width"], circle: Circle) -> Circle:
     """Fit the circle to its edge in the mean picture: least squares, without the points that are far off."""
-    for _ in range(rounds):
-        points = _edge(grey.mean(0), circle)[0]
+    for _ in range(ROUNDS):
+        points = _edge(mean, circle)[0]
         off = np.abs(np.hypot(points[:, 0] - circle.x, points[:, 1] - circle.y) - circle.radius)
         kept = points[off <= max(2 * float(np.median(off)), 0.5)]
         rows = np.column_stack([2 * kept, np.ones(len(kept))])

@@ -62,7 +62,7 @@ def residuals(
     soft = np.append(softness(maps, lights), 0.0)
     where = _where(maps, views, takes_part.astype(np.uint8), soft)
     first = maps.first_height[chosen]
-    least_empty(starts, owner, *where, TALLEST * maps.size, FINE * blur * maps.pixel, first, emptiness, height, by)
+    least_empty(starts, owner, where, TALLEST * maps.size, FINE * blur * maps.pixel, first, emptiness, height, by)
     maps.first_height[chosen] = first
     light, h = views[owner], height[:, None]
     at = np.concatenate([starts + (light[:, :2] - starts) * h / light[:, 2:], h], 1)
@@ -110,7 +110,7 @@ def _with_fixed_rays(found: Residuals, maps: OutlineMaps, views: Float[np.ndarra
     assert space is not None
     n = len(space.ends) - 1
     emptiness, chosen, by = np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
-    least_empty_points(space.points, space.ends, *where, emptiness, chosen, by)
+    least_empty_points(space.points, space.ends, where, emptiness, chosen, by)
     _, d_by = _derivatives(maps, views, space.points[chosen], by)
     d_by = d_by / _wide(where[5], by, space.points[chosen, 2], 0.0)
     owner = np.full(n, len(views) - 1)

@@ -131,31 +131,14 @@ def _fall(x, y, h, value, own, view, views, soft, across, up):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def least_empty(
-    starts,
-    owner,
-    views,
-    used,
-    fields,
-    corner,
-    cell,
-    soft,
-    space,
-    space_corner,
-    space_cell,
-    top,
-    fine,
-    first_height,
-    emptiness,
-    height,
-    by,
-):
+def least_empty(starts, owner, where, top, fine, first_height, emptiness, height, by):
     """For each ray find the height where the view that proves it emptiest proves least; see coherence.residuals.
 
     Where a point is found that no view proves empty, the search ends: emptiness 0, by no view.
 
     Args:
         starts: (rays, 2) ground points; owner: (rays,) index of the view that a ray leads to.
+        where: of the views and what they prove:
         views: (views, 3) lights and eye, z above the ground; used: (views,) 1 if a view takes part.
         fields: (views, n, n) signed distances; corner, cell: of the maps.
         soft: (views,) softness of a view's edges per height; see coherence.softness; the camera's, the last, is 0.
@@ -165,6 +148,7 @@ def least_empty(
             early lets the search skip most others.
         emptiness, height, by: (rays,) outputs: world length, height, index of the deciding view (-1: none, BY_SPACE).
     """
+    views, used, fields, corner, cell, soft, space, space_corner, space_cell = where
     for ray in prange(len(starts)):
         own = owner[ray]
         across = (views[own, 0] - starts[ray, 0]) / views[own, 2]
@@ -192,34 +176,20 @@ def least_empty(
 
 
 @njit(cache=True, nogil=True)  # little work: in parallel it would take longer to compile than it saves
-def least_empty_points(
-    points, ends, views, used, fields, corner, cell, soft, space, space_corner, space_cell, emptiness, chosen, by
-):
+def least_empty_points(points, ends, where, emptiness, chosen, by):
     """As least_empty, for rays that are given by their points: ray k has points[ends[k] : ends[k + 1]], z above ground.
 
     Args:
         chosen: (rays,) output: index of the point that is proven empty least.
     """
+    views, used, fields, corner, cell, soft, space, space_corner, space_cell = where
     for ray in range(len(ends) - 1):
         best, best_point, best_view, last = 1e9, ends[ray], -1, -1
         for step in range(ends[ray + 1] - ends[ray]):
             k = ends[ray] + _coarse_first(step, ends[ray + 1] - ends[ray])
+            x, y, h = points[k, 0], points[k, 1], points[k, 2]
             worst, last = _emptiest(
-                points[k, 0],
-                points[k, 1],
-                points[k, 2],
-                -1,
-                best,
-                last,
-                views,
-                used,
-                fields,
-                corner,
-                cell,
-                soft,
-                space,
-                space_corner,
-                space_cell,
+                x, y, h, -1, best, last, views, used, fields, corner, cell, soft, space, space_corner, space_cell
             )
             if worst < best:
                 best, best_point, best_view = worst, k, last

@@ -92,28 +92,16 @@ def outline_maps(
     lit = np.stack([look(one) > LIT for one in shadows.visibility]) & sure
     dark = sure & ~lit
     behind = look(unknown) > 0.5
-    fields = np.stack([signed_distance(one) for one in (*lit, ~behind)]) * cell
+    fields = (np.stack([signed_distance(one) for one in (*lit, ~behind)]) * cell).astype(np.float32)
     cast = [_from_object(one, behind) for one in dark]
     hidden = cv2.dilate(behind.astype(np.uint8), np.ones((2 * TOUCHING + 1, 2 * TOUCHING + 1), np.uint8)) > 0
     is_cut = np.array([_is_cut(one, ~known | one, hidden) for one, known in zip(cast, sure, strict=True)])
     outlines = [_outline(one, other) for one, other in zip(cast, lit, strict=True)]
     outlines = [corner + cell * (one + 0.5) for one in outlines] + [_silhouette(mask, points)]
     owner = np.repeat(np.arange(len(outlines)), [len(one) for one in outlines])
-    shadow, dark = np.stack(cast), dark & ~np.stack(cast)
-    return OutlineMaps(
-        fields.astype(np.float32),
-        shadow,
-        sure & ~dark,
-        corner,
-        cell,
-        is_cut,
-        np.concatenate(outlines),
-        owner,
-        foot,
-        size,
-        pixel,
-        np.zeros(len(owner)),
-    )
+    starts, shadow = np.concatenate(outlines), np.stack(cast)
+    known, first_height = sure & ~(dark & ~shadow), np.zeros(len(owner))
+    return OutlineMaps(fields, shadow, known, corner, cell, is_cut, starts, owner, foot, size, pixel, first_height)
 
 
 def with_cues(maps: OutlineMaps, cues: MetricCues, posed_camera: PosedCamera) -> OutlineMaps:

@@ -56,14 +56,7 @@ def _load(folder: Path, split: str) -> KnownScene:
     notes, has_ratios = (found, camera_note), (folder / INTENSITIES).is_file()
     mask = folder / MASK if (folder / MASK).is_file() else place / MASK
     return distant_scene(
-        photos,
-        lights,
-        posed_camera,
-        mask,
-        notes,
-        is_linear,
-        has_ratios=has_ratios,
-        dark=dark_photos(folder, listed),
+        photos, lights, posed_camera, mask, notes, is_linear, has_ratios=has_ratios, dark=dark_photos(folder, listed)
     )
 
 

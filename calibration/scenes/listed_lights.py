@@ -36,14 +36,8 @@ LONG_SIDE = 1000  # px of the pictures in which ball and highlights are measured
 FEWEST_LIGHTS = 4  # photos whose highlight was found
 PHOTOS = "photos"
 MASK = "mask.png"
-KINDS = (
-    "*.lp",
-    "*/*.lp",
-    "*.csv",
-    "*.dome",
-    "light*.json",
-    "light*.mat",
-)  # not calibration.json, which only --lights names
+# not calibration.json, which only --lights names
+KINDS = ("*.lp", "*/*.lp", "*.csv", "*.dome", "light*.json", "light*.mat")
 
 
 def load_with_ball(folder: Path, circle: tuple[float, float, float] | None) -> KnownScene | None:

@@ -8,7 +8,7 @@ ground is not given, and is estimated.
 """
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -35,15 +35,6 @@ from capture.session.sorting import scene_photos
 PARAMETERS, PHOTOS, SHADOWS, MASK = "params.json", "rgb", "visibility", "mask_obj.png"
 DIRECTIONS = "light_direction_sdps.npy"
 CAMERA_DISTANCE = 4.0  # of K[0][0] / height: the authors' default where it is not measured
-
-
-@dataclass(frozen=True)
-class _Given:
-    """The content of the files, in their own world frame: z is up."""
-
-    posed_camera: PosedCamera  # its ground is not known yet
-    places: Float[np.ndarray, "lights 3"]
-    note: str
 
 
 class _Parameters(Struct):
@@ -76,24 +67,20 @@ def _load(folder: Path, split: str) -> KnownScene:
     content = read_json(source)
     parameters = as_type(content, _Parameters, str(source), EXPORT)
     is_captured = "light_pos" not in content
-    if is_captured:
-        given = _captured(parameters, folder)
-    else:
-        pose, places = lamps(content, source)
-        given = _Given(PosedCamera(parameters.camera(), pose, 0.0), places, "")
-    found_photos, rows = _numbered(folder / PHOTOS, len(given.places), source)
+    camera = parameters.camera()
+    pose, places, note = _captured(camera, parameters.n_light, folder) if is_captured else (*lamps(content, source), "")
+    found_photos, rows = _numbered(folder / PHOTOS, len(places), source)
     shadows = [folder / SHADOWS / path.name for path in found_photos]
     has_shadows = all(path.is_file() for path in shadows)
     usable = scene_photos(found_photos, *([shadows] if has_shadows else []))
     photos, rows = usable.paths, [rows[row] for row in usable.rows]
-    size, camera = read_size(photos[0]), given.posed_camera.camera
+    size = read_size(photos[0])
     if size != (camera.width, camera.height):
         raise CalibrationError(
             f"{source}: 'imhw' is {camera.height} x {camera.width} and {photos[0].name} is {size[1]} x "
             f"{size[0]} (rows x columns); equal sizes were needed. Use the photos that the file describes."
         )
-    given = replace(given, places=given.places[rows])
-    calibration, found = _grounded(given, photos, is_captured)
+    calibration, found = _grounded(PosedCamera(camera, pose, 0.0), places[rows], photos, is_captured)
     mask = folder / MASK
     return KnownScene(
         with_common_power(calibration, preview(photos, is_linear=True)),
@@ -103,34 +90,35 @@ def _load(folder: Path, split: str) -> KnownScene:
         mask_is_grey=True,
         ground_known=found is not None,
         is_linear=True,
-        notes=tuple(filter(None, (given.note, found, "photos: pixel values are linear, as in this layout"))),
+        notes=tuple(filter(None, (note, found, "photos: pixel values are linear, as in this layout"))),
         photos=usable,
     )
 
 
-def _grounded(given: _Given, photos: list[Path], is_captured: bool) -> tuple[Calibration, str | None]:
+def _grounded(
+    posed_camera: PosedCamera, places: Float[np.ndarray, "lights 3"], photos: list[Path], is_captured: bool
+) -> tuple[Calibration, str | None]:
     """Return the scene on the ground estimated from shading, with a sentence; without one, in the picture's frame."""
     names = [path.name for path in photos]
-    lights = tuple(Light(n, "point", position=place) for n, place in zip(names, given.places, strict=True))
-    scene = Calibration.of(given.posed_camera, lights, unit="scene")
+    lights = tuple(Light(n, "point", position=place) for n, place in zip(names, places, strict=True))
+    scene = Calibration.of(posed_camera, lights, unit="scene")
     found = None if is_captured else find_ground_height(preview(photos, is_linear=True), scene)
     if found is not None:
         height, share = found
         note = f"ground: found at z = {height:.4g} from its shading, in {share:.0%} of the picture"
         return replace(scene, ground_height=height), note
-    eye = given.posed_camera.centre
-    away = float(np.median(np.linalg.norm(given.places - eye, axis=1)))
-    camera_from_world = given.posed_camera.world_from_camera.inverse()
+    eye = posed_camera.centre
+    away = float(np.median(np.linalg.norm(places - eye, axis=1)))
+    camera_from_world = posed_camera.world_from_camera.inverse()
     pose = Pose(LOOKING_DOWN, np.array([0.0, 0.0, float(np.linalg.norm(eye)) or away]))
-    places = pose.apply(camera_from_world.apply(given.places))
+    places = pose.apply(camera_from_world.apply(places))
     ground = min(0.0, float(places[:, 2].min()) - 0.1 * away)
     lights = tuple(replace(light, position=place) for light, place in zip(lights, places, strict=True))
-    return Calibration.of(PosedCamera(given.posed_camera.camera, pose, ground), lights, unit="scene"), None
+    return Calibration.of(PosedCamera(posed_camera.camera, pose, ground), lights, unit="scene"), None
 
 
-def _captured(given: _Parameters, folder: Path) -> _Given:
-    """The scene of photographs: directions at an assumed distance from the point looked at; picture's world frame."""
-    camera, count = given.camera(), given.n_light
+def _captured(camera: Camera, count: int, folder: Path) -> tuple[Pose, Float[np.ndarray, "lights 3"], str]:
+    """The camera's pose and the lights of photographs: at an assumed distance from the point looked at; with a note."""
     towards = read_npy(folder / DIRECTIONS)
     towards = towards[0] if towards.ndim == 3 else towards
     if towards.shape != (count, 3) or not np.isfinite(towards).all():
@@ -141,7 +129,7 @@ def _captured(given: _Parameters, folder: Path) -> _Given:
     away = CAMERA_DISTANCE * camera.fx / camera.height
     pose = Pose(LOOKING_DOWN, np.array([0.0, 0.0, away]))
     note = f"lights: directions only; they and the camera were assumed {away:.3g} units away, the layout's default"
-    return _Given(PosedCamera(camera, pose, 0.0), away * towards, note)
+    return pose, away * towards, note
 
 
 def _numbered(folder: Path, n_rows: int, source: Path) -> tuple[list[Path], list[int]]:

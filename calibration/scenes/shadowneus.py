@@ -21,7 +21,7 @@ from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.known_scene import Importer, KnownScene
 from calibration.light import Light
-from calibration.lights.layouts import FROM_BLENDER, Floor, Frame, Frames, read_params
+from calibration.lights.layouts import FROM_BLENDER, Floor, Frame, Frames, read_params, rigid
 from calibration.lights.photo_lists import photos_in
 from calibration.lights.power import LONG_SIDE, preview, shading_misfit, with_common_power
 from calibration.pose import Pose
@@ -153,10 +153,7 @@ def _fixed_camera(frames: Sequence[Frame], source: Path) -> Pose:
         raise CalibrationError(
             f"{source}: 'transform_matrix' of frame {moved[0]} differs from frame 0; all photos must share one camera."
         )
-    try:
-        return Pose.from_matrix(matrices[0] @ FROM_BLENDER)
-    except ValueError as error:
-        raise CalibrationError(f"{source}, frame 0: 'transform_matrix' is no rotation and translation.") from error
+    return rigid(matrices[0] @ FROM_BLENDER, f"{source}, frame 0", "'transform_matrix'")
 
 
 def _lights(frames: Sequence[Frame], pictures: list[Path], kind: str, height: float, source: Path) -> tuple[Light, ...]:
@@ -257,12 +254,7 @@ def _load_photographs(folder: Path, split: str) -> KnownScene:
     if (folder / MASK).is_file():
         notes.append(f"{MASK}: not used, it marks all possible object pixels; the outline is found from the photos")
     return KnownScene(
-        with_common_power(calibration, preview(photos)),
-        tuple(photos),
-        None,
-        None,
-        notes=tuple(notes),
-        photos=usable,
+        with_common_power(calibration, preview(photos)), tuple(photos), None, None, notes=tuple(notes), photos=usable
     )
 
 

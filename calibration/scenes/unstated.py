@@ -71,11 +71,7 @@ class _Samples:
 
 
 def read_shading(
-    photos: Sequence[Path],
-    lights: Sequence[Light],
-    is_linear: bool | None,
-    has_power: bool,
-    dark: Sequence[Path] = (),
+    photos: Sequence[Path], lights: Sequence[Light], is_linear: bool | None, has_power: bool, dark: Sequence[Path] = ()
 ) -> Shading:
     """Return a preview of the photos, with the curve that nothing states and powers that no list gives.
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from calibration.ground.outline_model import window_mean
 from calibration.posed_camera import PosedCamera
 from capture.checks.robust import column_spread, geman_mcclure
 
@@ -84,7 +85,7 @@ def ground_look(
     vote, sigma = outside.astype(np.float32), np.full(3, 0.2)
     residual = raw
     for _ in range(GAIN_ROUNDS):
-        residual = raw - _smooth(raw, vote)
+        residual = raw - window_mean(raw, vote, GAIN_WIDTH * max(vote.shape), GAIN_WIDTH * REDUCED, 1e-6)
         off = residual[outside]
         sigma = np.maximum(column_spread(off), NARROWEST)
         error = np.hypot(sigma, SHIFT * slope)
@@ -109,15 +110,3 @@ def _table(camera: PosedCamera, tripod: TripodView):
     finer = max(1.0, float(tripod.posed_camera.camera.fx / camera.camera.fx))
     log = cv2.GaussianBlur(log, (0, 0), SEEN_WIDTH * finer)
     return cv2.remap(log, at[..., 0], at[..., 1], cv2.INTER_LINEAR), known & free, known & ~free
-
-
-def _smooth(values: Float[np.ndarray, "height width 3"], vote: Float[np.ndarray, "height width"]) -> np.ndarray:
-    """Return the weighted mean of the values in a wide window, by normalized convolution on a small copy."""
-    height, width = vote.shape
-    scale = min(1.0, REDUCED / max(height, width))
-    size = (max(2, round(width * scale)), max(2, round(height * scale)))
-    total = cv2.resize(values * vote[..., None], size, interpolation=cv2.INTER_AREA)
-    count = cv2.resize(vote, size, interpolation=cv2.INTER_AREA)
-    sigma = GAIN_WIDTH * max(size)
-    total, count = cv2.GaussianBlur(total, (0, 0), sigma), cv2.GaussianBlur(count, (0, 0), sigma)
-    return cv2.resize(total / np.maximum(count, 1e-6)[..., None], (width, height), interpolation=cv2.INTER_LINEAR)

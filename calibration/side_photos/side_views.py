@@ -189,12 +189,7 @@ def _tripod(reference: Photo, seen: TripodObject) -> TripodView:
 
 
 def _side_view(
-    photo: Photo,
-    reference: Photo,
-    board: Board,
-    on_sheet: OnSheet,
-    tripod: TripodView,
-    seen: TripodObject,
+    photo: Photo, reference: Photo, board: Board, on_sheet: OnSheet, tripod: TripodView, seen: TripodObject
 ) -> SideView | str:
     camera, eye = tripod.posed_camera.camera, tripod.posed_camera.centre
     height, width = photo.rgb.shape[:2]

@@ -63,10 +63,7 @@ class Silhouette:
 
 
 def possible_region(
-    camera: PosedCamera,
-    reach: Float[np.ndarray, "n 3"],
-    eye: Float[np.ndarray, "3"],
-    top: float,
+    camera: PosedCamera, reach: Float[np.ndarray, "n 3"], eye: Float[np.ndarray, "3"], top: float
 ) -> Bool[np.ndarray, "height width"]:
     """Return where a photo may show what the tripod saw: the rays of its pixels from their ends up to `top`.
 
@@ -297,9 +294,7 @@ def _colour_odds(log: np.ndarray, thing: np.ndarray, rest: np.ndarray) -> Float[
 
 def _cut(odds: np.ndarray, links: list[np.ndarray], region: np.ndarray, favour: float) -> Bool[np.ndarray, "h w"]:
     """Return the cheapest cut; outside the region there is no object."""
-    gain = np.where(region, odds + favour * (region & (np.abs(odds) < 20)), -20.0).astype(float)
-    zero = np.zeros_like(gain)
-    return cheapest_region(np.maximum(-gain, zero), np.maximum(gain, zero), *(one.astype(float) for one in links))
+    return cheapest_region(np.where(region, odds + favour * (region & (np.abs(odds) < 20)), -20.0), *links)
 
 
 def _nearest(mask: Bool[np.ndarray, "height width"], place: Float[np.ndarray, "2"]) -> Bool[np.ndarray, "height width"]:

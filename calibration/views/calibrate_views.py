@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from calibration.board.board_photos import fit_boards
 from calibration.calibrate import calibrate
@@ -17,10 +18,7 @@ ViewPhotos = tuple[PhotoStack, Sequence[Finding]] | CaptureError  # under the fl
 
 
 def calibrate_views(
-    capture: Capture,
-    photos: Sequence[ViewPhotos],
-    board_spec: str | None = None,
-    lights: str = "auto",
+    capture: Capture, photos: Sequence[ViewPhotos], board_spec: str | None = None, lights: str | Path = "auto"
 ) -> CalibratedViews:
     """Calibrate the views of a capture in the frame of its board; those of each object pose in the frame of its own.
 
@@ -47,7 +45,7 @@ def calibrate_views(
 
 
 def _one_object_pose(
-    capture: Capture, photos: Sequence[ViewPhotos], board_spec: str | None, lights: str
+    capture: Capture, photos: Sequence[ViewPhotos], board_spec: str | None, lights: str | Path
 ) -> CalibratedViews:
     """Calibrate the views between which nothing moved but the camera."""
     faults: list[tuple[str, CalibrationError | CaptureError]] = []

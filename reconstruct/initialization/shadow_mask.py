@@ -177,7 +177,7 @@ class _Search:
         inside = np.where(kept, 0.0, np.where(in_sight, TO_BE_OBJECT, OUT_OF_SIGHT))
         outside = np.where(kept, LARGEST_DOUBT, doubt)
         across = (LINK / (1 + (x / self._usual) ** 2) + LEAST_LINK for x in (self._columns, self._rows))
-        return cheapest_region(inside, outside, *across)
+        return cheapest_region(outside - inside, *across)
 
     def _missed(self, mask: np.ndarray, smaller: np.ndarray, seen: _Evidence) -> list[np.ndarray]:
         """Find parts wrongly removed from the object: if they vote as ground, shadows elsewhere stay unexplained."""

@@ -100,7 +100,7 @@ def outline_of(scene: Scene, surface: SdfGrid, trust: Float[Tensor, "photos heig
     odds = _odds_of_object(scene, surface, first.distance, (seen, tried), asked, max(FLIPPED, wrong))
     odds = np.where(is_object, SURE, np.where(is_ground, -SURE, odds))
     links = (np.full(one.shape, LINK) for one in (odds[:, 1:], odds[1:]))
-    mask = np.where(odds == 0, seen, cheapest_region(np.maximum(-odds, 0), np.maximum(odds, 0), *links))
+    mask = np.where(odds == 0, seen, cheapest_region(odds, *links))
     unsure = near | (seen & (on_object > many))
     partly = np.where(tried, np.tanh(np.abs(odds) / 2), 0) * np.where(seen & ~mask, LEAVES, 1)
     confidence = np.where(is_object | is_ground | ~unsure, 1, partly)

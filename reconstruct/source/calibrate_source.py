@@ -12,9 +12,9 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
 from calibration.calibrate import WAYS
-from calibration.calibrate_with_file import calibrate_with_file, scene_with_file
 from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
+from calibration.lights_of_file import scene_with_file
 from calibration.views.calibrate_views import ViewPhotos, calibrate_views
 from capture.errors import CalibrationError, ReconstructionError
 from reconstruct.fields import SolvedScene
@@ -100,17 +100,13 @@ def with_light_error(calibration: Calibration, relative: float) -> Calibration:
 
 
 def _calibrated(source: Source, photos: Sequence[Photos], options: RunOptions) -> CalibratedViews:
-    stack = photos[0].stack
+    lights = options.lights if options.lights in WAYS else Path(options.lights)
     if source.known is not None:
-        if options.lights in WAYS or source.known.lights_from == Path(options.lights):
+        if isinstance(lights, str) or source.known.lights_from == lights:
             return CalibratedViews.of(source.known.with_notes())
-        return CalibratedViews.of(scene_with_file(source.known, stack, Path(options.lights)))
-    assert source.capture is not None and source.session is not None
-    if options.lights in WAYS:
-        return calibrate_views(source.capture, [_of_view(one) for one in photos], options.board, options.lights)
-    assert stack is not None
-    named = (Path(options.lights), options.board)
-    return CalibratedViews.of(calibrate_with_file(source.session, stack, *named, photos[0].findings), photos[0].view)
+        return CalibratedViews.of(scene_with_file(source.known, photos[0].stack, lights))
+    assert source.capture is not None
+    return calibrate_views(source.capture, [_of_view(one) for one in photos], options.board, lights)
 
 
 def _of_view(photos: Photos) -> ViewPhotos:

@@ -1,81 +1,60 @@
-"""Calibrate camera and ground from the board photos, and take the lights from a file."""
+"""Lights from a file: for a capture, combined with its own estimates, or in place of those of a scene."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from calibration.board.board import parse_board
-from calibration.board.board_photos import fit_board
-from calibration.calibrate import calibrate, left_out, refuse_other_size
 from calibration.calibration import Calibration
+from calibration.flashlight.light_estimate import LightFit
 from calibration.known_scene import KnownScene
 from calibration.light import Light
-from calibration.lights.files import GivenLights, read_lights, read_opinions
-from calibration.lights.fusion import disagree, fuse
+from calibration.lights.files import GivenLights, read_lights
+from calibration.lights.fusion import fuse
 from calibration.lights.photo_lists import bare
-from calibration.lights.power import on_albedo_scale, with_common_power, with_power_per_photo
+from calibration.lights.power import with_common_power, with_power_per_photo
 from calibration.posed_camera import PosedCamera
-from calibration.reframed import reframed
-from calibration.side_photos.side_views import metric_cues, side_notes
 from capture.errors import CalibrationError
 from capture.files.names import natural_order
-from capture.photos.finding import Finding
 from capture.photos.photo import PhotoStack
 from capture.session.session import Session
 
 IN_OBJECT = 0.2  # of the camera's distance from what it looks at: a lamp nearer to that stands in the object
 
 
-def calibrate_with_file(
-    session: Session, stack: PhotoStack, path: Path, board_spec: str | None = None, findings: Sequence[Finding] = ()
-) -> Calibration:
-    """Calibrate camera and ground from the session's board, with one or more lights per photo from a file.
+def lights_of_file(
+    path: Path, session: Session, stack: PhotoStack, posed_camera: PosedCamera, dropped: Mapping[str, str]
+) -> tuple[LightFit, list[str], bool]:
+    """Return one or more lights for each photo of a capture, notes, and whether the file gives the powers.
 
-    If the file gives no powers, they are estimated from the ground. A list whose entries all have a sigma is
-    combined light by light with the estimates from the photos; photos that it lacks keep their own estimates.
-    Photos from the side carve the hull; given lights stay where they are.
+    If not, these are estimated from the ground, on any common scale.
+
+    Args:
+        dropped: why photos get no light, by name.
 
     Raises:
-        CalibrationError: the board or the ground cannot be found, read_lights fails, or lights are below the
-            ground or in the object.
+        CalibrationError: read_lights fails, or lights are below the ground or in the object.
     """
-    opinions = read_opinions(path)
-    if opinions is not None:
-        _refuse_below(opinions, 0.0, path)
-        return with_opinions(calibrate(session, stack, board_spec, "auto", findings), opinions, path)
-    posed_camera, lens, residuals = fit_board(session, board_spec)
-    refuse_other_size(posed_camera.camera, stack)
-    posed_camera, framing_notes, _ = reframed(posed_camera, stack, findings)
     lit = [*stack.paths, *(one.photo for one in session.left_out if one.role == "lit")]
     every = [photo.name for photo in sorted(lit, key=natural_order)]
     given = read_lights(path, [photo.name for photo in stack.paths], posed_camera, every)
     _refuse_other_count(given, session.settings.lights_at_once, path)
-    dropped, usable = left_out(stack, findings)
-    notes = [*session.notes, *residuals.get("notes", []), *framing_notes, f"lights: from {path}", *given.notes]
-    lights = given.lights
+    lights, notes, residuals = given.lights, [f"lights: from {path}", *given.notes], {}
     kept = [light for light in lights if light.photo not in dropped]
-    _refuse_below(kept, posed_camera.ground_height, path)
+    refuse_below(kept, posed_camera.ground_height, path)
     _refuse_near(kept, posed_camera, path)
     if not given.has_power:
+        usable = np.array([photo.name not in dropped for photo in stack.paths])
         powered = with_power_per_photo(lights, stack, posed_camera, usable)
-        lights = powered.lights
-        notes += [powered.warning()] if powered.warning() else []
-        residuals = residuals | {"given_lights_misfit": powered.misfit}
+        lights, residuals = powered.lights, {"given_lights_misfit": powered.misfit}
+        notes += filter(None, [powered.warning()])
     lights = tuple(
         replace(light, used=False, reason=dropped[light.photo]) if light.photo in dropped else light for light in lights
     )
     ambient = np.zeros(3) if given.ambient is None else given.ambient
-    board = parse_board(residuals["board"])
-    cues, sides = metric_cues(session, stack, usable, posed_camera, board, lens.on_sheet)
-    notes += side_notes(sides)
-    rows = {"side_photos": [side.row() for side in sides], "left_out_photos": [one.row() for one in session.left_out]}
-    residuals = residuals | {"notes": notes} | rows
-    shared = {"beam": given.beam, "ambient": ambient, "residuals": residuals, "side_views": cues.views}
-    found = Calibration.of(posed_camera, lights, **shared)
-    return found if given.has_power else on_albedo_scale(found, stack)
+    return LightFit(lights, given.beam, ambient, residuals), notes, given.has_power
 
 
 def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> Calibration:
@@ -99,8 +78,8 @@ def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> 
             lights.append(light)
             continue
         places, sigmas = (light.position, given.position), (light.sigma, given.sigma)
-        mean, covariance, ratio = fuse(places, [np.diag(sigma**2) for sigma in sigmas])
-        apart += [light.photo] if disagree(ratio) else []
+        mean, covariance, contradict = fuse(places, [np.diag(sigma**2) for sigma in sigmas])
+        apart += [light.photo] if contradict else []
         lights.append(replace(light, position=mean, sigma=np.sqrt(np.diag(covariance))))
     notes = [*found.residuals.get("notes", []), f"lights: {len(opinions)} of {len(lights)} also from {path}"]
     if apart:
@@ -121,7 +100,7 @@ def scene_with_file(scene: KnownScene, stack: PhotoStack | None, path: Path) -> 
     own = scene.with_notes()
     photos = list(dict.fromkeys(light.photo for light in own.lights))
     given = read_lights(path, photos, own.posed_camera, scene.photos.every)
-    _refuse_below(given.lights, own.ground_height, path)
+    refuse_below(given.lights, own.ground_height, path)
     ambient = own.ambient if given.ambient is None else given.ambient
     lit = replace(own, lights=given.lights, beam=given.beam, ambient=ambient)
     if not given.has_power and stack is not None:
@@ -130,7 +109,7 @@ def scene_with_file(scene: KnownScene, stack: PhotoStack | None, path: Path) -> 
     return replace(lit, residuals=own.residuals | {"notes": notes})
 
 
-def _refuse_below(lights: Sequence[Light], height: float, path: Path) -> None:
+def refuse_below(lights: Sequence[Light], height: float, path: Path) -> None:
     """Refuse lights that do not stand above the ground: the file then uses other axes or another unit."""
     places = [(light.photo, *light.homogeneous()[2:].tolist()) for light in lights if light.used]
     low = [photo for photo, z, w in places if z <= w * height]
