@@ -37,10 +37,7 @@ NARROW = np.sin(np.radians(10.0))  # sine of a triangle's least angle, below whi
 
 
 def faced(
-    grid: SdfGrid,
-    vertices: Float[np.ndarray, "n 3"],
-    faces: Int[np.ndarray, "m 3"],
-    fixed: Bool[np.ndarray, " n"],
+    grid: SdfGrid, vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], fixed: Bool[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
     """Return the vertices after STEPS moves v += m, m = mean over triangles of n n . (c - n d / 2 - v) + MOMENTUM m.
 
@@ -128,10 +125,7 @@ def facing(
 
 
 def flipped(
-    grid: SdfGrid,
-    vertices: Float[np.ndarray, "n 3"],
-    faces: Int[np.ndarray, "m 3"],
-    fixed: Bool[np.ndarray, " n"],
+    grid: SdfGrid, vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], fixed: Bool[np.ndarray, " n"]
 ) -> Int[np.ndarray, "m 3"]:
     """Return the triangles of a closed mesh after some of its edges were turned over.
 

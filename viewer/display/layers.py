@@ -39,10 +39,8 @@ FIRST_FOV = float(np.radians(55.0))  # vertical
 RAISED = 0.58  # of half the height of an upright window: how far above its middle the object is shown
 FRAMED = 0.75  # of the window's shorter side, by the sphere around a finished object
 FIRST_TURN, FLATTER = np.radians(42.0), (1.0, 1.0, 0.6)  # the first view stands beside the camera, lower: it is seen
-FIRST_FARTHEST, FIRST_RAISED = (
-    1.7 * CAMERA_DISTANCE,
-    0.3 * CAMERA_DISTANCE,
-)  # shows most lights; farther, the object is small
+FIRST_FARTHEST = 1.7 * CAMERA_DISTANCE  # shows most lights; farther, the object is small
+FIRST_RAISED = 0.3 * CAMERA_DISTANCE
 
 AMBER, GREY, CHOSEN, PLAIN = (255, 184, 77), (120, 124, 134), (255, 92, 56), (196, 200, 208)
 

@@ -115,14 +115,8 @@ def lights_part(calibration: Calibration | None, mesh: trimesh.Trimesh | None) -
     above = ""
     if any(light.position is not None for light in calibration.lights):
         drawing = lights_from_above(calibration, None if mesh is None else mesh.bounds)
-        above = doc.figure(
-            drawing,
-            "From above; ellipses larger than the dots are two standard deviations",
-        )
-    polar = doc.figure(
-        coverage(calibration, centre),
-        f"{note} Middle: straight above; rim: level with the object.",
-    )
+        above = doc.figure(drawing, "From above; ellipses larger than the dots are two standard deviations")
+    polar = doc.figure(coverage(calibration, centre), f"{note} Middle: straight above; rim: level with the object.")
     rows = [_light_row(light, unit) for light in calibration.lights]
     misfits = calibration.residuals.get("shading_rms_by_photo", {})
     rows = [(*row[:5], _plainly(misfits.get(row[0], "")), row[5]) for row in rows]

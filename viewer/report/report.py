@@ -27,14 +27,7 @@ from viewer.display.run_follower import RunFollower, status
 from viewer.report import document as doc
 from viewer.report.check_page import KINDS
 from viewer.report.numbers import calibration_part, cost_part, curves_part, findings, lights_part
-from viewer.report.pictures import (
-    comparison_part,
-    guess_facts,
-    maps_part,
-    mesh_pictures,
-    photos_part,
-    size_facts,
-)
+from viewer.report.pictures import comparison_part, guess_facts, maps_part, mesh_pictures, photos_part, size_facts
 
 T = TypeVar("T")
 SETTINGS = tuple(setting.name for setting in fields(RunOptions))

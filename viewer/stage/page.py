@@ -22,20 +22,8 @@ from reconstruct.stored_run.stage_pack import STAGE_PACK, StagePack, addressed, 
 from reconstruct.stored_run.stored_run import FIELDS, MESH, StoredRun
 from viewer.report.document import as_address, hash_of
 
-SCRIPTS = (
-    "vectors",
-    "scene",
-    "state",
-    "gpu",
-    "passes",
-    "renderer",
-    "pick",
-    "overlay",
-    "notes",
-    "hands",
-    "panel",
-    "main",
-)
+SCRIPTS = ("vectors", "scene", "state", "gpu", "passes", "renderer")
+SCRIPTS += ("pick", "overlay", "notes", "hands", "panel", "main")
 SHADERS = ("surface.vert", "surface.frag", "depth.frag", "full.vert", "light.frag", "blur.frag", "show.frag")
 SHADERS += ("lines.vert", "lines.frag")
 IMPORTED, EXPORTED = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL), re.compile(r"^export ", re.MULTILINE)
@@ -122,12 +110,7 @@ def _fault(run_dir: Path) -> str:
 
 
 def page_html(
-    name: str,
-    pack: StagePack,
-    document: dict[str, Any] | None = None,
-    saves: str = "",
-    home: str = "",
-    fault: str = "",
+    name: str, pack: StagePack, document: dict[str, Any] | None = None, saves: str = "", home: str = "", fault: str = ""
 ) -> str:
     """Return the page's HTML.
 
