@@ -82,15 +82,6 @@ def write_stage(run_dir: Path) -> None:
         temporary.write_bytes(content)
 
 
-def stage_page(run_dir: Path) -> str:
-    """Return the page of a finished run with everything in it.
-
-    Raises:
-        UserError: the run is not finished, or a file of it cannot be used.
-    """
-    return page_of(run_dir, stage_pack(run_dir))
-
-
 def page_of(run_dir: Path, pack: StagePack, saves: str = "", home: str = "") -> str:
     """Return the page of a run, whose packed stage this is, with its title and document; see `page_html`.
 

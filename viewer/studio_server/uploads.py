@@ -1,4 +1,4 @@
-"""Files under way over HTTP: tus 1.0.0 with creation and termination (https://tus.io/protocols/resumable-upload).
+"""Files under way over HTTP: tus 1.0.0 with creation (https://tus.io/protocols/resumable-upload).
 
 The owner's page and the phones' use the same routes; who may send to which capture is the caller's.
 """
@@ -34,7 +34,7 @@ class Uploads:
         """Return the routes below /upload."""
         return [
             Route("/upload", self.create, methods=["POST"]),
-            Route("/upload/{id}", self.answer, methods=["HEAD", "PATCH", "DELETE"]),
+            Route("/upload/{id}", self.answer, methods=["HEAD", "PATCH"]),
         ]
 
     async def create(self, request: Request) -> Response:
@@ -46,15 +46,12 @@ class Uploads:
         return Response(status_code=201, headers=TUS | {"Location": f"/upload/{part.id}"})
 
     async def answer(self, request: Request) -> Response:
-        """Say how much of a file is here, take its next piece, or forget it."""
+        """Say how much of a file is here, or take its next piece."""
         part = self._part(request)
         if part is None:
             return Response(status_code=404, headers=TUS)
         if request.method == "PATCH":
             return await self._append(request, part)
-        if request.method == "DELETE":
-            self._parts.drop(part)
-            return Response(status_code=204, headers=TUS)
         part = await self._finished(part)  # a sender that was told of a full disk asks here before it goes on
         return Response(headers=TUS | {"Upload-Length": str(part.size)} | self._where(part))
 
