@@ -68,10 +68,9 @@ def page_scale(calibration: Calibration) -> PageScale:
 
 def light_position(light: Light, scale: PageScale) -> Float[np.ndarray, "3"]:
     """Return where a light is drawn, page units: its position, or, of a directional one, that way from the centre."""
-    if light.position is not None:
-        return scale.to_page(light.position)
-    assert light.direction is not None
-    return scale.to_page(scale.centre) + CAMERA_DISTANCE * light.direction
+    *place, is_near = light.homogeneous()
+    way = np.array(place)
+    return scale.to_page(way) if is_near else scale.to_page(scale.centre) + CAMERA_DISTANCE * way
 
 
 def first_view(calibration: Calibration, scale: PageScale) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:

@@ -177,11 +177,9 @@ def _place(light: Light, checked: CaptureCheck) -> list[str]:
     if not light.used:
         return ["not used", "", "", ""]
     centre, unit = checked.cover.centre, "mm" if checked.calibration.unit == "mm" else ""
-    way = light.direction if light.position is None else light.position - centre
-    assert way is not None
-    length = float(np.linalg.norm(way))
+    way, length = light.seen_from(centre)
     side = side_in_words(float(np.arctan2(way[1], way[0])), checked.calibration, centre)
-    elevation = f"{np.degrees(np.arcsin(np.clip(way[2] / length, -1, 1))):.0f}°"
+    elevation = f"{np.degrees(np.arcsin(np.clip(way[2], -1, 1))):.0f}°"
     if light.position is None:
         return [side, elevation, "far", ""]
     return [side, elevation, f"{length:.3g} {unit}".strip(), f"{2 * np.linalg.norm(light.sigma):.2g} {unit}".strip()]
