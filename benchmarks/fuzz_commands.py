@@ -19,7 +19,7 @@ from capture.intake.parts import Parts
 from reconstruct.export.export import ExportOptions, export
 from reconstruct.run.queue import Queue
 from viewer.page.guard import GuardedServer
-from viewer.stage.page import stage_pack, stage_page
+from viewer.stage.page import page_of, stage_pack
 from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder
 from viewer.studio.helper import Helper
@@ -95,7 +95,7 @@ def staged(run: Path) -> int:
     """The page that is lit by the pointer, with all its parts."""
     pack = stage_pack(run)
     assert all(isinstance(pack.read(name), bytes) for name in pack.names)
-    stage_page(run)
+    page_of(run, stage_pack(run))
     return 0
 
 

@@ -26,7 +26,7 @@ from capture.session.sorting import photos_of
 from reconstruct.render.studio import studio_of
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.stage.facts import home_pose
-from viewer.stage.page import stage_page
+from viewer.stage.page import page_of, stage_pack
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SOFTWARE_GL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -116,7 +116,7 @@ def main() -> None:
     capture, run, target = Path(sys.argv[1]), Path(sys.argv[2]), Path(__file__).parent / "pictures"
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         page = Path(folder) / "page.html"
-        page.write_text(stage_page(run), encoding="utf-8")
+        page.write_text(page_of(run, stage_pack(run)), encoding="utf-8")
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_GL)
         tab = opened(browser, page, PAGE_SIZE)
         wait(tab, FINEST)

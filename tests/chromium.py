@@ -30,9 +30,8 @@ NO_DRAWING = """for (const kind of [WebGLRenderingContext, WebGL2RenderingContex
 class Followed:
     """A run folder with the pages of its visitors, looked at again and again as `view` does."""
 
-    def __init__(self, run_dir: Path, server: GuardedServer | None = None):
-        self.run_dir = run_dir
-        self.server = server or GuardedServer("127.0.0.1", 0)
+    def __init__(self, run_dir: Path):
+        self.run_dir, self.server = run_dir, GuardedServer("127.0.0.1", 0)
         self.visitors = Visitors(run_dir, self.server)
         self.url = f"http://localhost:{self.server.get_port()}"
         self._end = threading.Event()
@@ -101,9 +100,12 @@ def canvas_pixels(tab) -> np.ndarray:
     return before
 
 
-def open_page(browser, url, is_drawn: bool = True, size: dict[str, int] = VIEWPORT):
-    """The page, and what it complained about or asked of others; its panels alone cost half as much."""
+def open_page(browser, url, is_drawn: bool = True, size: dict[str, int] = VIEWPORT, cookie: str = ""):
+    """The page, and what it complained about or asked of others; without 3-D pictures it costs half as much."""
     tab = browser.new_page(viewport=size)
+    if cookie:
+        name, _, value = cookie.partition("=")
+        tab.context.add_cookies([{"name": name, "value": value, "url": url}])
     if not is_drawn:
         tab.add_init_script(NO_DRAWING)
     tab.set_default_timeout(PATIENCE_MS)
@@ -117,5 +119,4 @@ def open_page(browser, url, is_drawn: bool = True, size: dict[str, int] = VIEWPO
     tab.on("pageerror", lambda error: bad.append(str(error)))
     tab.on("request", lambda r: None if r.url.startswith((url, "data:", "blob:", "ws:")) else bad.append(r.url))
     tab.goto(url)
-    tab.wait_for_selector("canvas")
     return tab, bad

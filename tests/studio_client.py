@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 import threading
-import time
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -27,16 +26,16 @@ ROOT = Path(__file__).parent.parent
 
 
 class Client:
-    """Requests to one port, with the headers of a page of that port."""
+    """Requests to one port, with the headers of a page of that port; None leaves one out."""
 
-    def __init__(self, port: int, cookie: str = "", **headers: str):
-        self.port, self.cookie, self.headers = port, cookie, headers
+    def __init__(self, port: int, cookie: str = ""):
+        self.port, self.cookie = port, cookie
 
-    def raw(self, method: str, path: str, body: bytes | None = None, **headers: str) -> http.client.HTTPResponse:
+    def raw(self, method: str, path: str, body: bytes | None = None, **headers: str | None) -> http.client.HTTPResponse:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
-        own = {"Origin": f"http://127.0.0.1:{self.port}"} if method not in ("GET", "HEAD") else {}
-        cookie = {"Cookie": self.cookie} if self.cookie else {}
-        connection.request(method, path, body, own | cookie | self.headers | headers)
+        own = {"Origin": f"http://127.0.0.1:{self.port}" if method not in ("GET", "HEAD") else None}
+        every = own | {"Cookie": self.cookie or None} | headers
+        connection.request(method, path, body, {name: value for name, value in every.items() if value is not None})
         answer = connection.getresponse()
         try:
             answer.content = answer.read()
@@ -115,14 +114,7 @@ class Process:
         line = self.process.stdout.readline()
         self.port, token = re.search(r"localhost:(\d+)/\?token=(\S+)", line).groups()
         self.port = int(self.port)
-        end = time.monotonic() + PATIENCE_S
-        while True:
-            try:
-                self.client = Client(self.port, cookie_of(self.port, token))
-                return
-            except OSError:
-                assert time.monotonic() < end
-                time.sleep(0.05)
+        self.client = Client(self.port, cookie_of(self.port, token))
 
     def kill(self) -> None:
         self.process.kill()

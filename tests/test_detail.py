@@ -13,12 +13,12 @@ from calibration.known_scene import KnownScene
 from calibration.pose import Pose
 from capture.errors import CaptureError, ReconstructionError
 from capture.photos.photo import decode_srgb, read_photo, read_stack
-from reconstruct.appearance.brdf import LOBES
+from reconstruct.appearance.brdf import LOBES, Gloss
 from reconstruct.appearance.lobe_fit import Samples
 from reconstruct.detail import full_photos as detail_photos
 from reconstruct.detail.detail import estimate_illumination, solve_detail
 from reconstruct.detail.file import DETAIL, SURE, UNIT, load_details, save_details
-from reconstruct.detail.fit import PixelGloss, detail_at, fit_albedo, fit_detail, specular_part
+from reconstruct.detail.fit import detail_at, fit_albedo, fit_detail, specular_part
 from reconstruct.detail.full_photos import FullPhotos, colours_of, full_photos
 from reconstruct.detail.surface import Window, merged, rotated, see_surface
 from reconstruct.fields import FurtherView
@@ -34,10 +34,6 @@ from reconstruct.source.photos import read_photos
 from reconstruct.source.source import RunOptions, Source
 
 
-def said_nothing(done, total, message):
-    """Progress that nobody looks at."""
-
-
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory):
     return relief_ball.make(tmp_path_factory.mktemp("relief"))
@@ -45,12 +41,15 @@ def ball(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def detail(ball, tmp_path_factory):
+    return detail_of(ball, ball.fields, tmp_path_factory.mktemp("work"))
+
+
+def detail_of(ball, fields, folder):
+    """The detail of a ball's photos on these fields, for which a file lies in the folder for a while."""
     stack = read_stack(ball.paths, 160)
     scene = build_scene(stack, ball.calibration, 160)
-    files = full_photos(stack, scene.photo_names)
-    folder = tmp_path_factory.mktemp("work")
-    around = estimate_illumination(scene, ball.fields)
-    found = solve_detail(around, ball.fields, ball.calibration.camera, files, folder, said_nothing)
+    files, around = full_photos(stack, scene.photo_names), estimate_illumination(scene, fields)
+    found = solve_detail(around, fields, ball.calibration.camera, files, folder, lambda *_: None)
     assert found is not None and not list(folder.iterdir())
     return found
 
@@ -212,7 +211,7 @@ def test_the_solved_gloss_is_taken_off(samples):
     true, given = samples
     lobes = torch.zeros(1, LOBES, 3)
     lobes[0, 2] = 0.25
-    pixel_gloss = PixelGloss(lobes, torch.ones(200, 1))
+    pixel_gloss = Gloss(lobes, torch.ones(200, 1))
     glossy = replace(given, value=given.value + specular_part(given, true, pixel_gloss))
     plain, _ = fit_detail(glossy, torch.full((200,), 0.5), NOISE, None)
     better, _ = fit_detail(glossy, torch.full((200,), 0.5), NOISE, pixel_gloss)
@@ -258,12 +257,7 @@ def both(ball, detail, turned, tmp_path_factory):
     other, motion = turned
     further = FurtherView("turned_1", 1.3 * ball.fields.albedo, ball.fields.camera, ball.fields.world_from_camera)
     fields = replace(ball.fields, view="view_1", further=(replace(further, object_from_world=motion),))
-    stack = read_stack(other.paths, 160)
-    scene = build_scene(stack, other.calibration, 160)
-    files, seen = full_photos(stack, scene.photo_names), fields.views()[1]
-    folder, camera = tmp_path_factory.mktemp("both"), other.calibration.camera
-    found = solve_detail(estimate_illumination(scene, seen), seen, camera, files, folder, said_nothing)
-    assert found is not None
+    found = detail_of(other, fields.views()[1], tmp_path_factory.mktemp("both"))
     return fields, (detail, replace(found, view=1, object_from_world=motion))
 
 

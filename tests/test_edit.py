@@ -46,13 +46,10 @@ def test_smoothing_shrinks_a_ball_by_its_curvature_and_flattens_a_relief(ball):
     x, _, z = np.meshgrid(*3 * [np.arange(64.0)], indexing="ij")
     wave, height = 16.0, 0.5
     values = torch.from_numpy((z - 32 - height * np.sin(2 * np.pi * x / wave)).astype(np.float32))
-    grid = edited_fields(_with(ball, values), Edit(smooth=4.0)).grid.values.numpy()
+    relief = replace(ball, grid=SdfGrid(values, torch.zeros(3), 1.0))
+    grid = edited_fields(relief, Edit(smooth=4.0)).grid.values.numpy()
     kept = np.exp(-2 * (np.pi * 2.0 / wave) ** 2)
     assert np.abs(np.ptp(grid[16:48, 32, 32]) - 2 * kept * height).max() < 0.01
-
-
-def _with(fields: SolvedScene, values: torch.Tensor) -> SolvedScene:
-    return replace(fields, grid=SdfGrid(values, torch.zeros(3), 1.0))
 
 
 def test_a_crop_box_cuts_a_closed_segment_of_a_ball(ball):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from fake_run import fields_of, make_truth, mesh_of
 from laid_anew import laid_anew
+from scipy.spatial.transform import Rotation
 
 from calibration.calibration import save_calibration
 from calibration.lights.files import read_lights
@@ -94,13 +95,7 @@ def test_a_point_seen_through_colmaps_files_is_where_our_camera_sees_it(finished
     assert (model, int(width), int(height)) == ("PINHOLE", 64, 48)
     lines = [line for line in (sparse / "images.txt").read_text().split("\n") if not line.startswith("#")]
     w, x, y, z, *translation = map(float, lines[0].split()[1:8])
-    rotation = np.array(  # of a unit quaternion
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
     for point in POINTS:
         at = rotation @ np.array(point) + translation
         pixel = np.array([fx * at[0] / at[2] + cx, fy * at[1] / at[2] + cy])

@@ -33,9 +33,12 @@ CAMERA = Camera(64, 48, 70.0, 70.0, 31.0, 24.5, (0.1, -0.05, 0.002, -0.001, 0.0)
 POSE = looking_at(np.array([0.3, -3.0, 2.2]), MIDDLE)
 
 
-def fields(albedo: torch.Tensor | None = None) -> SolvedScene:
+NOTHING = SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01)
+
+
+def fields(albedo: torch.Tensor | None = None, grid: SdfGrid | None = None) -> SolvedScene:
     albedo = torch.full((48, 64, 3), 0.5) if albedo is None else albedo
-    return SolvedScene(sphere_grid(), albedo, CAMERA, POSE, 0.0, "scene")
+    return SolvedScene(grid or sphere_grid(), albedo, CAMERA, POSE, 0.0, "scene")
 
 
 def everywhere(view: RenderView, material: Material) -> RenderView:
@@ -90,18 +93,14 @@ def test_unshadowed_ground_obeys_the_inverse_square_law_and_the_ambient_term(vie
     assert np.allclose(picture[-1, 0].numpy(), expected, rtol=1e-4)
 
 
-def fields_rest() -> tuple:
-    return torch.full((48, 64, 3), 0.5), CAMERA, POSE, 0.0, "scene"
-
-
 def test_the_penumbra_of_an_edge_is_as_wide_as_similar_triangles_say():
     top, bottom, lamp_height, radius, spacing = 0.5, 0.4, 2.5, 0.2, 0.02
     x, _, z = torch.meshgrid(*[spacing * torch.arange(n) for n in (60, 60, 30)], indexing="ij")
     slab = torch.maximum(x - 0.6, (z - 0.45).abs() - 0.05)  # a plate whose edge lies under the lamp
     edge = SdfGrid(slab.float(), torch.tensor([-0.6, -0.6, 0.0]), spacing)
     above = Camera(240, 3, 300.0, 300.0, 119.5, 1.0, (0.0, 0.0, 0.0, 0.0, 0.0))
-    nothing = SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01)
-    seen = surface_maps(nothing, PosedCamera(above, looking_down(0.4), 0.0))
+    down = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.4]))
+    seen = surface_maps(NOTHING, PosedCamera(above, down, 0.0))
     lamp = Light("p", "point", np.array([0.0, 0.0, lamp_height]))
     share = lit_share(RenderView(seen, torch.ones(3, 240, 3), edge, torch.zeros(3)), lamp, radius, 400)[1]
     along = seen.points[1, :, 0]
@@ -109,10 +108,6 @@ def test_the_penumbra_of_an_edge_is_as_wide_as_similar_triangles_say():
     # an edge that hides 10 % of a disc lies 0.687 radii from its middle; the top limits the outer half of the penumbra
     expected = 0.687 * radius * (top / (lamp_height - top) + bottom / (lamp_height - bottom))
     assert abs(width / expected - 1) < 0.05
-
-
-def looking_down(height: float) -> Pose:
-    return Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, height]))
 
 
 def test_under_a_white_sky_every_surface_shows_its_albedo_times_the_sky_it_sees(view):
@@ -149,7 +144,7 @@ def test_a_surrounding_equals_the_sum_over_all_texels_to_a_hundredth():
 
 @pytest.mark.parametrize("sky", [evening((64, 128)), torch.ones(64, 128, 3), 7 * evening((64, 128)).roll(9, 1)])
 def test_white_paper_on_open_ground_is_as_bright_under_every_sky(sky):
-    free = look(SolvedScene(SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01), *fields_rest()), width=8)
+    free = look(fields(grid=NOTHING), width=8)
     sky = exposed(sky)
     white = environment(free, sky) / free.albedo
     assert torch.allclose(white, ground_light(sky).expand_as(white), rtol=0.02)
@@ -170,8 +165,7 @@ SHARP = Material((1.0, 1.0, 1.0), (0.1, 0.1, 0.1), 0.15)
 
 @pytest.mark.parametrize("material", [GLOSSY, SHARP, MATERIALS["gold"]])
 def test_in_a_white_furnace_a_surface_shows_what_it_reflects_and_never_more_than_all(material):
-    empty = SolvedScene(SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01), *fields_rest())
-    furnace = everywhere(look(empty, width=8), material)
+    furnace = everywhere(look(fields(grid=NOTHING), width=8), material)
     picture = environment(furnace, torch.ones(16, 32, 3))
     cosine = (furnace.eye - furnace.maps.points)[..., 2] / (furnace.eye - furnace.maps.points).norm(dim=-1)
     mirrored = reflectance(material.coefficients().expand(*cosine.shape, -1, -1), cosine)

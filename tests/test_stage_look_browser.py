@@ -15,7 +15,7 @@ from reconstruct.render.relight import lit_share
 from reconstruct.render.soft_light import sky_share
 from reconstruct.render.studio import FOCAL_HEIGHTS, looking_at, studio_of, towards
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.stage.page import stage_page
+from viewer.stage.page import page_of, stage_pack
 
 pytestmark = pytest.mark.browser
 
@@ -34,7 +34,7 @@ def run(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def page_file(run) -> Path:
     file = run / "page.html"
-    file.write_text(stage_page(run))
+    file.write_text(page_of(run, stage_pack(run)))
     return file
 
 

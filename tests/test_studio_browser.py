@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from chromium import NO_DRAWING, PATIENCE_MS, wait_until
+from chromium import open_page, wait_until
 from studio_client import served
 from test_studio import capture_in, run_in
 
@@ -15,21 +15,8 @@ RULES = (Path(__file__).parent / "page_rules.js").read_text()
 
 
 def opened(browser, client, size, is_drawn: bool = True):
-    """A page of the studio, and all that it complained about or asked of others; without 3-D pictures it costs less."""
-    context = browser.new_context(viewport=size)
-    name, _, value = client.cookie.partition("=")
-    address = f"http://127.0.0.1:{client.port}"
-    context.add_cookies([{"name": name, "value": value, "url": address}])
-    tab = context.new_page()
-    if not is_drawn:
-        tab.add_init_script(NO_DRAWING)
-    tab.set_default_timeout(PATIENCE_MS)
-    bad = []
-    tab.on("console", lambda message: bad.append(message.text) if message.type == "error" else None)
-    tab.on("pageerror", lambda error: bad.append(str(error)))
-    tab.on("request", lambda r: None if r.url.startswith((address, "data:", "blob:")) else bad.append(r.url))
-    tab.goto(address)
-    return tab, bad
+    """A page of the studio, and all that it complained about or asked of others."""
+    return open_page(browser, f"http://127.0.0.1:{client.port}", is_drawn, size, client.cookie)
 
 
 def test_names_of_strangers_are_text_and_mistakes_are_sentences(browser, tmp_path):

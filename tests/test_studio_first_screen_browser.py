@@ -8,11 +8,10 @@ from studio_client import served
 from test_studio import capture_in, run_in
 from test_studio_browser import DESKTOP, PHONE, RULES, opened
 
-from capture.errors import CaptureError
 from capture.session.session import load_settings
 from capture.session.sorting import photos_of
 from reconstruct.stored_run.stage_pack import opened_pack
-from viewer.studio import library, studio
+from viewer.studio import library
 
 SMALL = {"width": 1000, "height": 640}
 TITLE = "Übung & 1"
@@ -45,16 +44,6 @@ def test_the_example_is_a_capture_and_a_run_of_its_own_each_time(tmp_path):
     for key, card in cards.items():
         assert card["title"] == library.EXAMPLE and len(card["runs"]) == 1
         assert len(photos_of(tmp_path / key)) == card["count"] == 45 and load_settings(tmp_path / key).board
-
-
-def test_an_installation_without_the_examples_photos_says_so(tmp_path, monkeypatch):
-    def missing() -> Path:
-        raise CaptureError("The example's photos did not come with this installation.")
-
-    monkeypatch.setattr(studio, "example_photos", missing)
-    with served(tmp_path) as (_, _, owner):
-        status, answer = owner.post("try_example")
-    assert status == 400 and "did not come" in answer["error"] and not (tmp_path / "captures").exists()
 
 
 @pytest.mark.browser

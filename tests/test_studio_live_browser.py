@@ -21,10 +21,7 @@ pytestmark = [
 ]
 SPOT = Path(__file__).parent.parent / "examples" / "spot"
 BOARD = "charuco:5x7:30:22:DICT_4X4_50"
-PER_SECOND, HELD = (
-    2,
-    10,
-)  # frames of the video; each photo is held for 5 s, which two busy cores need to see it stand still
+PER_SECOND, HELD = 2, 10  # frames of the video: each photo is held for 5 s; two busy cores must see it stand still
 BOARDS = [SPOT / "board" / f"IMG_000{number}.jpg" for number in (1, 3, 5, 7, 9)]
 LIT = sorted((SPOT / "photos").iterdir())[::3]
 

@@ -57,6 +57,7 @@ def test_without_the_secret_of_the_address_nothing_is_shown(open_studio, path):
         {"Origin": "http://evil.example"},
         {"Origin": "null"},
         {"Origin": ""},
+        {"Origin": None},
     ],
 )
 def test_other_pages_and_names_that_were_bound_anew_are_refused(open_studio, headers):
@@ -64,14 +65,6 @@ def test_other_pages_and_names_that_were_bound_anew_are_refused(open_studio, hea
     assert owner.raw("POST", "/api/new", b'{"title": "x"}', **headers).status == 403
     if "Host" in headers:
         assert owner.raw("GET", "/api/state", **headers).status == 403
-
-
-def test_a_change_without_an_origin_is_refused(open_studio):
-    owner = open_studio[2]
-    connection = http.client.HTTPConnection("127.0.0.1", owner.port)
-    connection.request("POST", "/api/empty_trash", b"{}", {"Cookie": owner.cookie})
-    assert connection.getresponse().status == 403
-    connection.close()
 
 
 def test_every_answer_forbids_what_comes_from_elsewhere(open_studio):
@@ -87,10 +80,8 @@ def test_every_answer_forbids_what_comes_from_elsewhere(open_studio):
 def test_a_page_of_a_run_that_may_be_a_strangers_gets_no_origin(open_studio):
     answer = open_studio[2].raw("GET", "/report?key=runs/vase")
     policy = answer.headers["Content-Security-Policy"]
-    assert (
-        answer.status == 200 and policy.startswith("sandbox; default-src 'none'") and "allow-same-origin" not in policy
-    )
-    assert answer.headers["X-Frame-Options"] == "SAMEORIGIN"
+    assert policy.startswith("sandbox; default-src 'none'") and "allow-same-origin" not in policy
+    assert answer.status == 200 and answer.headers["X-Frame-Options"] == "SAMEORIGIN"
 
 
 def test_our_pages_have_no_code_or_style_that_the_policy_would_forbid_and_load_nothing_from_elsewhere():
@@ -177,11 +168,10 @@ def test_uploads_are_held_to_their_size_and_their_id(open_studio):
     assert owner.piece("/upload/../../etc/passwd", 0, b"1").status in (404, 405)
     assert owner.piece(address.replace("/upload/", "/upload/0"), 0, b"1").status == 404
     assert owner.raw("PATCH", address, b"1", **{"Upload-Offset": "0"}).status == 415
-    assert owner.raw("DELETE", address).status == 204 and owner.raw("HEAD", address).status == 404
 
 
 @pytest.fixture
-def let_in(open_studio, monkeypatch):
+def let_in(open_studio):
     _, door, owner = open_studio
     owner.ok("let_in", key="vase")
     row = owner.get("/api/phones")[1]
@@ -230,22 +220,17 @@ def test_a_phone_sends_to_the_capture_of_its_door_alone_and_reaches_nothing_else
     assert Client(owner.port, phone.cookie).raw("GET", "/api/state").status == 401
 
 
-@pytest.mark.parametrize(
-    "who", ["owner", "another phone", "a phone of the same name", "a phone that calls itself owner"]
-)
-def test_a_file_under_way_is_changed_by_its_sender_alone(let_in, who):
+@pytest.mark.parametrize("name", [None, "Nokia", "Pixel", "owner"])  # of another phone; None: the owner
+def test_a_file_under_way_is_changed_by_its_sender_alone(let_in, name):
     door, owner, port, token = let_in
     phone = joined(port, token)
-    name = {"another phone": "Nokia", "a phone named owner": "owner"}.get(who, "Pixel")
-    other = owner if who == "owner" else joined(port, door.door.token, name)
+    other = joined(port, door.door.token, name) if name else owner
     for sender, stranger in ((phone, other), (other, phone)):
         photo = jpeg(13)
         address = sender.create("vase", "mine.jpg", len(photo)).headers["Location"]
         assert sender.piece(address, 0, photo[:9]).status == 204
         assert stranger.raw("HEAD", address).status == stranger.piece(address, 9, photo[9:]).status == 404
-        assert stranger.raw("DELETE", address).status in (204, 404)
         assert sender.raw("HEAD", address).headers["Upload-Offset"] == "9"
-        assert sender.raw("DELETE", address).status == 204 and sender.raw("HEAD", address).status == 404
 
 
 def test_a_full_disk_is_a_sentence_to_a_phone_whose_file_goes_on_once_there_is_room(let_in, open_studio):
@@ -271,13 +256,9 @@ def test_two_programs_that_ask_for_one_port_at_once_get_two():
         assert one.getsockname() != other.getsockname()
 
 
-def test_phones_are_sent_away_by_the_switch_and_by_time(open_studio, monkeypatch):
-    _, door, owner = open_studio
-    owner.ok("let_in", key="vase")
-    address = owner.get("/api/phones")[1]["address"]
-    port = int(re.search(r":(\d+)/", address).group(1))
-    wait_until(lambda: _answers(port))
-    phone = joined(port, address.partition("#")[2])
+def test_phones_are_sent_away_by_the_switch_and_by_time(let_in):
+    door, owner, port, token = let_in
+    phone = joined(port, token)
     assert phone.raw("GET", "/api/state").status == 200
     door.door.until = time.time() - 1
     assert owner.get("/api/phones")[1]["on"] is False

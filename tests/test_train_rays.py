@@ -168,19 +168,12 @@ def places(count: int = 200) -> torch.Tensor:
     return 3.2 * torch.rand(count, 3, generator=generator()) - 1.6
 
 
-def grid_field() -> GridField:
-    return GridField(33, REACH, START, LEVEL, generator())
-
-
-def hash_field() -> HashField:
-    return HashField(HashLevels(coarsest=8, finest=32, levels=4, rows=2**10), REACH, START, LEVEL, generator())
-
-
-def neural_field() -> NeuralField:
-    return NeuralField(SMALL, START, generator())
-
-
-TRAINABLE = {"grid": grid_field, "hash": hash_field, "neural": neural_field}
+LEVELS = HashLevels(coarsest=8, finest=32, levels=4, rows=2**10)
+TRAINABLE = {
+    "grid": lambda: GridField(33, REACH, START, LEVEL, generator()),
+    "hash": lambda: HashField(LEVELS, REACH, START, LEVEL, generator()),
+    "neural": lambda: NeuralField(SMALL, START, generator()),
+}
 
 
 def test_the_paper_s_network_starts_as_a_ball_and_has_its_sizes():
@@ -213,7 +206,7 @@ def test_the_gradient_is_that_of_the_sdf(name):
 
 
 def test_the_trainable_grid_reads_like_the_solved_one():
-    field, points = grid_field(), 1.3 * places()
+    field, points = TRAINABLE["grid"](), 1.3 * places()
     values = field.values.detach().reshape(33, 33, 33)
     same = SdfGrid(values, torch.full((3,), -REACH), 2 * REACH / 32)
     torch.testing.assert_close(field.sdf(points).detach(), same.sdf(points), atol=1e-5, rtol=1e-5)

@@ -1,5 +1,4 @@
 import os
-from pathlib import Path
 
 import fake_run
 import numpy as np
@@ -8,11 +7,9 @@ import trimesh
 
 from viewer.display import layers
 from viewer.display.layers import FIRST_FOV, framed_view, light_position, page_mesh, page_scale
-from viewer.display.run_follower import RunFollower, loss_curves, size_text, status
+from viewer.display.run_follower import RunFollower, loss_curves, status
 from viewer.page.controls import continued
 from viewer.page.page import Page
-
-ROOT = Path(__file__).parent.parent
 
 
 def test_the_status_says_stage_count_and_time_left_and_that_a_run_which_let_go_has_stopped():
@@ -49,12 +46,6 @@ def test_the_final_mesh_is_shown_once_it_is_this_runs_whatever_the_dates_of_the_
     (tmp_path / "preview.ply").write_text("newer")
     assert follower.mesh_name([{"stage": "solve/64"}]) == "preview.ply"
     assert follower.mesh_name([{"stage": "done"}]) == follower.mesh_name([]) == "mesh.ply"
-
-
-def test_millimetres_are_named_and_scene_units_are_not():
-    times = "\N{MULTIPLICATION SIGN}"
-    assert size_text(np.array([1.0, 2, 3]), "mm") == f"1.0 {times} 2.0 {times} 3.0 mm"
-    assert "mm" not in size_text(np.array([1.0, 2, 3]), "scene")
 
 
 def test_a_log_is_read_again_once_it_has_changed_without_lines_that_are_damaged_or_half_written(tmp_path):

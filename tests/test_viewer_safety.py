@@ -14,8 +14,8 @@ import msgspec
 import psutil
 import pytest
 import viser
-import viser._viser
 import websockets
+from studio_client import Client
 from waiting import PATIENCE_S
 
 from reconstruct.run.bundle import without_paths
@@ -45,15 +45,10 @@ def shared():
 
 
 def get(port: int, path: str = "/", **headers: str) -> http.client.HTTPResponse:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
-    connection.request("GET", path, headers={"Connection": "close"} | headers)
-    answer = connection.getresponse()
-    answer.read()
-    connection.close()
-    return answer
+    return Client(port).raw("GET", path, **headers)
 
 
-def talk(port: int, *messages, origin: str | None = "", raw: bool = False, taken=lambda: True, **headers: str) -> int:
+def talk(port: int, *messages, origin: str | None = "", taken=lambda: True, **headers: str) -> int:
     """Send messages as a page would. The status of a refused handshake, the code of a closing; 101: all was taken.
 
     Args:
@@ -61,19 +56,13 @@ def talk(port: int, *messages, origin: str | None = "", raw: bool = False, taken
     """
 
     async def conversation() -> int:
-        protocol = [f"viser-v{viser.__version__}"]
-        sender = f"http://127.0.0.1:{port}" if origin == "" else origin
+        options = {"subprotocols": [f"viser-v{viser.__version__}"], "additional_headers": headers, "max_size": None}
+        options["origin"] = f"http://127.0.0.1:{port}" if origin == "" else origin
         try:
-            async with websockets.connect(
-                f"ws://127.0.0.1:{port}",
-                origin=sender,
-                subprotocols=protocol,
-                additional_headers=headers,
-                max_size=None,
-            ) as connection:
+            async with websockets.connect(f"ws://127.0.0.1:{port}", **options) as connection:
                 await connection.recv()
                 for message in messages:
-                    await connection.send(message if raw else msgspec.msgpack.encode(message))
+                    await connection.send(msgspec.msgpack.encode(message))
                 await asyncio.sleep(0.1 if messages else 0)
                 await connection.ping()
                 end = time.monotonic() + PATIENCE_S
@@ -90,21 +79,14 @@ def talk(port: int, *messages, origin: str | None = "", raw: bool = False, taken
     return asyncio.run(conversation())
 
 
-def only_closed() -> bool:
-    """Never taken: talk then waits for the closing."""
-    return False
-
-
 # --- by which name, and from which page ------------------------------------------------------------------------------
 
 
 def test_the_page_listens_on_this_machine_alone_unless_asked(server):
     assert inspect.signature(view).parameters["host"].default == "127.0.0.1"
     port = server.get_port()
-    bound = [
-        c.laddr.ip for c in psutil.Process().net_connections("tcp") if c.status == "LISTEN" and c.laddr.port == port
-    ]
-    assert bound == ["127.0.0.1"]
+    mine = [c.laddr for c in psutil.Process().net_connections("tcp") if c.status == "LISTEN" and c.laddr.port == port]
+    assert [address.ip for address in mine] == ["127.0.0.1"]
     assert is_loopback("localhost") and is_loopback("::1") and is_loopback("127.0.0.9") and not is_loopback("0.0.0.0")
 
 
@@ -212,14 +194,6 @@ def test_of_a_hundred_addresses_that_climb_out_of_the_page_none_is_looked_for_on
     assert not asked
 
 
-# --- the tunnel ------------------------------------------------------------------------------------------------------
-
-
-def test_a_client_cannot_open_the_public_share_tunnel(server, monkeypatch):
-    monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *_: pytest.fail("a tunnel was opened"))
-    assert talk(server.get_port(), {"type": "ShareUrlRequest"}, taken=only_closed) == REFUSED
-
-
 # --- what a page may send --------------------------------------------------------------------------------------------
 
 
@@ -244,7 +218,7 @@ STRANGE = [
     {"type": "FileTransferPart", "part_index": 0, "content": b"x", **FILE},
     {"type": "GetRenderResponseMessage", "payload": b"x", "render_uuid": "x"},
     {"type": "SceneNodeClickMessage", "name": "/mesh"},
-    {"type": "ShareUrlRequest"},
+    {"type": "ShareUrlRequest"},  # viser's public tunnel
     {"type": "GuiUpdateMessage", "uuid": "x", "updates": [["value", 1]]},
     {"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": 1, "visible": True}},
     {"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": "0" * guard.LARGEST}},
@@ -254,7 +228,7 @@ STRANGE = [
 @pytest.mark.parametrize("message", STRANGE, ids=lambda one: one["type"])
 def test_files_pictures_and_large_messages_end_the_connection(server, message):
     assert fault_of(msgspec.msgpack.encode(message))
-    assert talk(server.get_port(), message, taken=only_closed) == REFUSED
+    assert talk(server.get_port(), message, taken=lambda: False) == REFUSED
 
 
 def test_a_message_changes_the_value_of_a_control_and_nothing_else_about_it():
@@ -263,5 +237,5 @@ def test_a_message_changes_the_value_of_a_control_and_nothing_else_about_it():
         update = {"type": "GuiUpdateMessage", "uuid": slider._impl.uuid}
         assert talk(asked.get_port(), update | {"updates": {"value": 3}}, taken=lambda it=slider: it.value == 3) == 101
         strange = update | {"updates": {"parent_container_id": "nowhere"}}
-        assert talk(asked.get_port(), strange, taken=only_closed) == REFUSED
+        assert talk(asked.get_port(), strange, taken=lambda: False) == REFUSED
         assert slider._impl.parent_container_id != "nowhere"

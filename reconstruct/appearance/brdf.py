@@ -20,14 +20,14 @@ ANGLES = 64  # of view, for which reflectance is tabulated
 
 @dataclass(frozen=True)
 class Gloss:
-    """The specular part of a picture's surfaces: at a pixel, sum over m of weights[m] * lobes[m]."""
+    """The specular part of surfaces, of a picture's or of some pixels': sum over m of weights[m] * lobes[m]."""
 
     lobes: Float[Tensor, "materials lobes 3"]  # coefficients, non-negative; relative to Light.power, as albedo is
-    weights: Float[Tensor, "height width materials"]  # non-negative; 0 on the ground
+    weights: Float[Tensor, "*pixels materials"]  # non-negative; 0 on the ground
 
-    def coefficients(self) -> Float[Tensor, "height width lobes 3"]:
+    def coefficients(self) -> Float[Tensor, "*pixels lobes 3"]:
         """Return the lobe coefficients of each pixel, 27 numbers."""
-        return torch.einsum("hwm,mlc->hwlc", self.weights, self.lobes)
+        return torch.einsum("...m,mlc->...lc", self.weights, self.lobes)
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,6 @@ class Lobes:
 
     coefficients: Float[Tensor, "lobes 3"]  # of appearance.brdf.specular; zeros where nothing glossy was seen
     sigma: float  # of a sample, robust
-    gain: float  # share of the mean square residual of the Lambertian fit that the lobes explain
 
 
 def gather(
@@ -107,11 +106,11 @@ def fit_lobes(samples: Samples) -> Lobes:
     """
     nothing = torch.zeros(LOBES, 3)
     if float((samples.weight > 0).sum()) < FEWEST_SAMPLES:
-        return Lobes(nothing, np.inf, 0.0)
+        return Lobes(nothing, np.inf)
     _, plain_sigma, plain = _reweighted(samples, is_glossy=False)
     solved, sigma, glossy = _reweighted(samples, is_glossy=True)
     gain = 1 - glossy / max(plain, 1e-20)
-    return Lobes(solved, sigma, gain) if gain > LEAST_GAIN else Lobes(nothing, plain_sigma, gain)
+    return Lobes(solved, sigma) if gain > LEAST_GAIN else Lobes(nothing, plain_sigma)
 
 
 def shared_lobes(samples: Samples) -> Float[Tensor, "lobes 3"]:

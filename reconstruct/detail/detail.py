@@ -16,9 +16,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from calibration.camera import Camera
+from reconstruct.appearance.brdf import Gloss
 from reconstruct.appearance.lobe_fit import Indirect, Samples, from_endless_ground
 from reconstruct.detail.file import SURE, UNIT, Detail
-from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail
+from reconstruct.detail.fit import fit_albedo, fit_detail
 from reconstruct.detail.full_photos import BYTES_PER_SAMPLE, CHANNELS, FullPhotos, PixelFile, colours_of
 from reconstruct.detail.surface import LitMap, SeenSurface, find_lit, merged, see_surface
 from reconstruct.fields import SolvedScene
@@ -119,7 +120,7 @@ class _Blocks:
     lit: LitMap
     pixels: PixelFile
 
-    def __iter__(self) -> Iterator[tuple[slice, Samples, Float[Tensor, "n 3"], PixelGloss | None]]:
+    def __iter__(self) -> Iterator[tuple[slice, Samples, Float[Tensor, "n 3"], Gloss | None]]:
         """Yield each block's pixels, samples, albedo of the surface, and gloss."""
         for part in _blocks(self.seen):
             yield part, self._samples(part), *self.material(part)
@@ -140,13 +141,11 @@ class _Blocks:
             normals=normals,
         )
 
-    def material(self, part: slice) -> tuple[Float[Tensor, "n 3"], PixelGloss | None]:
+    def material(self, part: slice) -> tuple[Float[Tensor, "n 3"], Gloss | None]:
         """Return albedo and gloss of the working-resolution pixel that contains each pixel."""
         row, column = _in_working_picture(self.seen, self.seen.index[part], self.camera, self.fields.camera)
         gloss = self.fields.gloss
-        return self.fields.albedo[row, column], None if gloss is None else PixelGloss(
-            gloss.lobes, gloss.weights[row, column]
-        )
+        return self.fields.albedo[row, column], gloss and Gloss(gloss.lobes, gloss.weights[row, column])
 
 
 def _blocks(seen: SeenSurface) -> list[slice]:

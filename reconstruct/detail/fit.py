@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from calibration.camera import Camera
-from reconstruct.appearance.brdf import specular
+from reconstruct.appearance.brdf import Gloss, specular
 from reconstruct.appearance.lobe_fit import Samples, least_squares_albedo
 from reconstruct.detail.file import SURE, Detail
 from reconstruct.render.g_buffer import RenderView
@@ -131,28 +131,19 @@ def with_detail(view: RenderView, details: Sequence[Detail], camera: Camera) -> 
     return replace(view, maps=replace(view.maps, normals=normals), albedo=albedo)
 
 
-@dataclass(frozen=True)
-class PixelGloss:
-    """The specular lobes of some pixels' materials, as reconstruct.appearance.brdf.Gloss."""
-
-    lobes: Float[Tensor, "materials lobes 3"]
-    weights: Float[Tensor, "n materials"]
-
-
 def specular_part(
-    samples: Samples, normals: Float[Tensor, "n 3"], pixel_gloss: PixelGloss | None
+    samples: Samples, normals: Float[Tensor, "n 3"], pixel_gloss: Gloss | None
 ) -> Float[Tensor, "n photos 3"]:
     """Return the specular part of every sample, linear, for unit world normals that may differ from the surface's."""
     if pixel_gloss is None:
         return torch.zeros(()).expand_as(samples.value)
-    coefficients = torch.einsum("nm,mlc->nlc", pixel_gloss.weights, pixel_gloss.lobes)[:, None]
-    mirrored = specular(coefficients, normals[:, None], samples.towards, samples.eye[:, None])
+    mirrored = specular(pixel_gloss.coefficients()[:, None], normals[:, None], samples.towards, samples.eye[:, None])
     cosine = (samples.towards @ normals[..., None]).clamp(min=0)
     return mirrored * cosine * samples.strength
 
 
 def fit_detail(
-    samples: Samples, albedo: Float[Tensor, " n"], noise: Noise, pixel_gloss: PixelGloss | None
+    samples: Samples, albedo: Float[Tensor, " n"], noise: Noise, pixel_gloss: Gloss | None
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """Fit unit world normals, and their trust in [0, 1]: 0 where too few photos agree.
 
@@ -194,7 +185,7 @@ def _pixels(
 
 
 def fit_albedo(
-    samples: Samples, normals: Float[Tensor, "n 3"], pixel_gloss: PixelGloss | None
+    samples: Samples, normals: Float[Tensor, "n 3"], pixel_gloss: Gloss | None
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """Fit the linear albedo of pixels with known normals by reweighted least squares; also its number of inliers."""
     value = samples.value - specular_part(samples, normals, pixel_gloss)

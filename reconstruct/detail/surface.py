@@ -58,10 +58,6 @@ class SeenSurface:
     inner: Float[np.ndarray, " n"]  # 0 at an outline, 1 from BORDER_VOXELS inwards
     footprint: float  # width of a pixel on a surface that faces the camera, world length
 
-    def picture(self, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "height width"]:
-        """Return the pixels' values as a picture of the window, 0 elsewhere."""
-        return _picture(self.window, self.index, values)
-
 
 @dataclass(frozen=True)
 class LitMap:
@@ -109,6 +105,7 @@ def see_surface(fields: SolvedScene, camera: Camera) -> SeenSurface | None:
 def _picture(
     window: Window, index: Int[np.ndarray, " n"], values: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "height width"]:
+    """Return the pixels' values as a picture of the window, 0 elsewhere."""
     out = np.zeros(window.height * window.width, np.float32)
     out[index] = values
     return out.reshape(window.height, window.width)
@@ -203,7 +200,7 @@ def smoothed(seen: SeenSurface, vectors: Float[Tensor, "n 3"], sigma: float) -> 
     size = (-(-seen.window.width // shrink), -(-seen.window.height // shrink))
     full = (seen.window.width, seen.window.height)
     for axis in range(3):
-        picture = seen.picture(np.asarray(vectors[:, axis]))
+        picture = _picture(seen.window, seen.index, np.asarray(vectors[:, axis]))
         if shrink > 1:
             picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
         picture = cv2.GaussianBlur(picture, (0, 0), sigma / shrink)

@@ -38,8 +38,7 @@ class Dataset:
     photos: tuple[Path, ...] | None  # the capture's; None: the surface is relit
     calibration: Calibration  # of the view
     fields: SolvedScene  # as the view saw them, in the world of its object pose
-    view: str = ""
-    further: tuple["Dataset", ...] = ()  # of the other views, where there are several
+    view: str
 
     @property
     def posed_camera(self) -> PosedCamera:
@@ -50,10 +49,6 @@ class Dataset:
         """Return world_from_something in the world of the first view: not its own for another object pose."""
         motion = self.fields.object_from_world
         return matrix if motion is None else motion.matrix() @ matrix
-
-    def every(self) -> tuple["Dataset", ...]:
-        """Return the data sets of all views."""
-        return (self, *self.further)
 
     @cached_property
     def stems(self) -> tuple[str, ...]:
@@ -75,8 +70,8 @@ class Dataset:
             yield relight(view, light, self.calibration.beam, self.calibration.ambient).numpy()
 
 
-def open_dataset(run: StoredRun, photos: Path | None = None) -> Dataset:
-    """Return the run's cameras and lights, with the capture's photos or pictures of the relit surface.
+def open_datasets(run: StoredRun, photos: Path | None) -> tuple[Dataset, ...]:
+    """Return camera and lights of each view of a run, with the capture's photos or pictures of the relit surface.
 
     Args:
         photos: folder of the capture, or of its photos; None: relit, at the size the solver worked at.
@@ -84,18 +79,17 @@ def open_dataset(run: StoredRun, photos: Path | None = None) -> Dataset:
     Raises:
         ReconstructionError: no light was used, or a photo is missing, of another size, or lit by several lights.
     """
-    first, *further = (_of_view(run, photos, *view) for view in run.views)
-    return replace(first, further=tuple(further))
+    return tuple(_of_view(run, photos, *view) for view in run.views)
 
 
 def _of_view(run: StoredRun, photos: Path | None, view: str, calibration: Calibration, fields: SolvedScene) -> Dataset:
-    used = [light for light in calibration.lights if light.used]
+    used = tuple(light for light in calibration.lights if light.used)
     if not used:
         raise ReconstructionError(
             f"{run.run_dir} has no light that was used; at least one was needed. Calibrate again."
         )
     if photos is None:
-        return Dataset(run, tuple(used), fields.camera, None, calibration, fields, view)
+        return Dataset(run, used, fields.camera, None, calibration, fields, view)
     names = [light.photo for light in used]
     if len(set(names)) < len(names):
         raise ReconstructionError(
@@ -104,14 +98,13 @@ def _of_view(run: StoredRun, photos: Path | None, view: str, calibration: Calibr
         )
     paths = tuple(_photo(photos / view, name) for name in names)
     camera = calibration.camera
-    for path in paths[:1]:
-        height, width = read_photo(path).rgb.shape[:2]
-        if (width, height) != (camera.width, camera.height):
-            raise ReconstructionError(
-                f"{path} is {width} x {height} pixels, {camera.width} x {camera.height} as in the run was needed. Give "
-                "the capture that the run was made from."
-            )
-    return Dataset(run, tuple(used), camera, paths, calibration, fields, view)
+    height, width = read_photo(paths[0]).rgb.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise ReconstructionError(
+            f"{paths[0]} is {width} x {height} pixels, {camera.width} x {camera.height} as in the run was needed. Give "
+            "the capture that the run was made from."
+        )
+    return Dataset(run, used, camera, paths, calibration, fields, view)
 
 
 def centred(camera: Camera) -> Camera:

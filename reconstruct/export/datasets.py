@@ -6,7 +6,7 @@ without rotation tags, so that every picture matches the exported camera.
 
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from calibration.pose import Pose
 from capture.files.atomic import write_json
 from capture.files.title import file_stem
 from capture.photos.photo import encode_srgb, write_picture
-from reconstruct.export.dataset import Dataset, centred, kind_of, light_matrix, open_dataset, opengl
+from reconstruct.export.dataset import Dataset, centred, kind_of, light_matrix, open_datasets, opengl
 from reconstruct.export.export import Contents, ExportOptions, OnProgress, Writer
 from reconstruct.render.g_buffer import look, surface_maps
 from reconstruct.stored_run.stage_pack import ZIP_TIME
@@ -33,7 +33,7 @@ HALF = 0.5  # px: these programs count from the corner of the first pixel, we fr
 # --- ShadowNeuS ------------------------------------------------------------------------------------------------------
 
 
-def write_shadowneus(data: Dataset, out: Path, on_progress: OnProgress) -> None:
+def write_shadowneus(views: Sequence[Dataset], out: Path, on_progress: OnProgress) -> None:
     """Write transforms_train.json (a light pose per photo), transforms_floor.json, train/, and test_one/ with the mask.
 
     The layout has one focal length and no distortion, so the pictures are those of a centred camera without distortion.
@@ -42,14 +42,13 @@ def write_shadowneus(data: Dataset, out: Path, on_progress: OnProgress) -> None:
         ReconstructionError: the run has both near and far lights.
         OSError: a file cannot be written.
     """
+    data = views[0]
     camera, kind = centred(data.camera), kind_of(data.lights, "the ShadowNeuS layout")
-    frames = []
+    pose, frames = opengl(data.posed_camera.world_from_camera).tolist(), []
     for stem, light in zip(data.stems, data.lights, strict=True):
         sun = light_matrix(light, data.posed_camera).tolist()
-        frames.append({"file_path": f"train/{stem}", "transform_matrix_sun": sun})
-    pose = opengl(data.posed_camera.world_from_camera).tolist()
+        frames.append({"file_path": f"train/{stem}", "transform_matrix_sun": sun, "transform_matrix": pose})
     angle = 2 * np.arctan(camera.width / 2 / camera.fx)
-    frames = [{**frame, "transform_matrix": pose} for frame in frames]
     floor = np.eye(4)
     floor[2, 3] = data.posed_camera.ground_height
     _pictures(data, camera, out / "train", ".png", on_progress)
@@ -66,7 +65,7 @@ def write_shadowneus(data: Dataset, out: Path, on_progress: OnProgress) -> None:
 # --- RTI -------------------------------------------------------------------------------------------------------------
 
 
-def write_rti(data: Dataset, out: Path, on_progress: OnProgress) -> None:
+def write_rti(views: Sequence[Dataset], out: Path, on_progress: OnProgress) -> None:
     """Write JPEG pictures, an .lp file of light directions, and .dome and .relight projects, also with positions.
 
     Directions and positions are in the picture's axes (x right, y up, z towards the camera), with the origin at the
@@ -76,6 +75,7 @@ def write_rti(data: Dataset, out: Path, on_progress: OnProgress) -> None:
         ReconstructionError: the run has both near and far lights.
         OSError: a file cannot be written.
     """
+    data = views[0]
     kind, middle = kind_of(data.lights, "an RTI"), data.posed_camera.looked_at()
     away = float(np.linalg.norm(middle - data.posed_camera.centre))
     width = away * data.camera.width / data.camera.fx
@@ -112,7 +112,7 @@ def _xyz(rows: np.ndarray) -> list[dict[str, float]]:
 # --- COLMAP ----------------------------------------------------------------------------------------------------------
 
 
-def write_colmap(data: Dataset, out: Path, on_progress: OnProgress) -> None:
+def write_colmap(views: Sequence[Dataset], out: Path, on_progress: OnProgress) -> None:
     """Write images/ and sparse/0/: cameras.txt, images.txt (camera_from_world), points3D.txt (points of the surface).
 
     The pictures of a view share camera and pose. Its points are observed in the first of them only, each in a track of
@@ -124,7 +124,7 @@ def write_colmap(data: Dataset, out: Path, on_progress: OnProgress) -> None:
     images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
     rows = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
     image, point_id = 1, 1
-    for number, view in enumerate(data.every(), start=1):
+    for number, view in enumerate(views, start=1):
         _pictures(view, view.camera, out / "images", ".jpg", on_progress)
         model, numbers = colmap_camera(view.camera)
         size = f"{view.camera.width} {view.camera.height}"
@@ -169,12 +169,12 @@ def _surface_points(data: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 # --- NeRF ------------------------------------------------------------------------------------------------------------
 
 
-def write_nerf(data: Dataset, out: Path, on_progress: OnProgress) -> None:
+def write_nerf(views: Sequence[Dataset], out: Path, on_progress: OnProgress) -> None:
     """Write images/ and transforms.json: OpenGL cameras, the lens as in nerfstudio, and the light of each frame.
 
     With several views each frame has its own lens, as nerfstudio reads it.
     """
-    views, frames = data.every(), []
+    data, frames = views[0], []
     for view in views:
         _pictures(view, view.camera, out / "images", ".jpg", on_progress)
         pose = view.in_common(opengl(view.posed_camera.world_from_camera)).tolist()
@@ -209,25 +209,24 @@ def _nerf_lens(camera: Camera) -> dict[str, float]:
 # --- folders and archives --------------------------------------------------------------------------------------------
 
 
-def _writer(layout: Callable[[Dataset, Path, OnProgress], None], of_all_views: bool = False) -> Writer:
+def _writer(layout: Callable[[Sequence[Dataset], Path, OnProgress], None], of_all_views: bool = False) -> Writer:
     """Return the function that writes a layout as a folder, or as a zip of it if the path ends in .zip."""
 
     def write(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> Contents:
-        data = open_dataset(run, options.photos)
+        views = open_datasets(run, options.photos)
+        views = views if of_all_views else views[:1]
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place) / path.stem if path.suffix else path
             folder.mkdir()
-            layout(data, folder, on_progress)
+            layout(views, folder, on_progress)
             if path.suffix:
                 with zipfile.ZipFile(path, "w") as archive:
                     for file in sorted(part for part in folder.rglob("*") if part.is_file()):
                         entry = zipfile.ZipInfo(file.relative_to(place).as_posix(), ZIP_TIME)
                         archive.writestr(entry, file.read_bytes(), zipfile.ZIP_DEFLATED)
-        count = sum(len(view.lights) for view in (data.every() if of_all_views else (data,)))
-        source = "of the relit surface" if data.photos is None else "of the capture"
-        return Contents(
-            pixels=(data.camera.width, data.camera.height), note=f"{count} pictures {source}, camera and lights"
-        )
+        count, camera = sum(len(view.lights) for view in views), views[0].camera
+        source = "of the relit surface" if options.photos is None else "of the capture"
+        return Contents(pixels=(camera.width, camera.height), note=f"{count} pictures {source}, camera and lights")
 
     return write
 

@@ -145,13 +145,8 @@ class EditedSurface:
 
     run: StoredRun
     mesh: trimesh.Trimesh  # closed; what is a guess is still there
+    fields: SolvedScene  # with the same edits
     edit: Edit
-    edited: SolvedScene | None = None  # None: those of the run
-
-    @property
-    def fields(self) -> SolvedScene:
-        """The solved scene with the same edits."""
-        return self.run.fields if self.edited is None else self.edited
 
     @property
     def details(self) -> tuple[Detail, ...]:
@@ -207,6 +202,6 @@ def edited_surface(run: StoredRun) -> EditedSurface:
         low, high = (tuple(document["crop"][end]) for end in ("low", "high")) if document["crop"] else (None, None)
         edit = Edit(low, high, float(document["smooth"]), document["guess"] == "cut")
     if edit.low is None and not edit.smooth:
-        return EditedSurface(run, run.mesh, edit)
+        return EditedSurface(run, run.mesh, run.fields, edit)
     fields = edited_fields(run.fields, edit)
-    return EditedSurface(run, edited_mesh(fields, run.mesh, edit), edit, fields)
+    return EditedSurface(run, edited_mesh(fields, run.mesh, edit), fields, edit)

@@ -159,7 +159,8 @@ def _object_pictures(
         photo = camera.fx / fields.camera.fx * width, camera.fy / fields.camera.fy * height
         window = detail.window
         shares = window.left / photo[0], window.top / photo[1], window.width / photo[0], window.height / photo[1]
-        return *detail_pictures(small)[:1], shares, detail_pictures(small)[1]
+        albedo, normals = detail_pictures(small)
+        return albedo, shares, normals
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if not len(rows):
         rows, columns = np.array([0, height - 1]), np.array([0, width - 1])

@@ -1,6 +1,7 @@
 """Extract a closed, coloured triangle mesh of the object without the ground from the SDF; write PLY and GLB."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -205,7 +206,7 @@ def mesh_material(fields: SolvedScene, mesh: trimesh.Trimesh) -> MetalRough | No
         return None
     vertices = torch.from_numpy(np.asarray(mesh.vertices)).float()
     _, weights = material_at(seen_material(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
-    coefficients = torch.einsum("nm,mlc->nlc", weights, fields.gloss.lobes)
+    coefficients = replace(fields.gloss, weights=weights).coefficients()
     return metal_rough(torch.from_numpy(decode_srgb(vertex_colours(mesh))), coefficients)
 
 

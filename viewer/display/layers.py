@@ -39,10 +39,8 @@ FIRST_FOV = float(np.radians(55.0))  # vertical
 RAISED = 0.58  # of half the height of an upright window: how far above its middle the object is shown
 FRAMED = 0.75  # of the window's shorter side, by the sphere around a finished object
 FIRST_TURN, FLATTER = np.radians(42.0), (1.0, 1.0, 0.6)  # the first view stands beside the camera, lower: it is seen
-FIRST_FARTHEST, FIRST_RAISED = (
-    1.7 * CAMERA_DISTANCE,
-    0.3 * CAMERA_DISTANCE,
-)  # shows most lights; farther, the object is small
+FIRST_FARTHEST = 1.7 * CAMERA_DISTANCE  # shows most lights; farther, the object is small
+FIRST_RAISED = 0.3 * CAMERA_DISTANCE
 
 AMBER, GREY, CHOSEN, PLAIN = (255, 184, 77), (120, 124, 134), (255, 92, 56), (196, 200, 208)
 
@@ -70,10 +68,9 @@ def page_scale(calibration: Calibration) -> PageScale:
 
 def light_position(light: Light, scale: PageScale) -> Float[np.ndarray, "3"]:
     """Return where a light is drawn, page units: its position, or, of a directional one, that way from the centre."""
-    if light.position is not None:
-        return scale.to_page(light.position)
-    assert light.direction is not None
-    return scale.to_page(scale.centre) + CAMERA_DISTANCE * light.direction
+    *place, is_near = light.homogeneous()
+    way = np.array(place)
+    return scale.to_page(way) if is_near else scale.to_page(scale.centre) + CAMERA_DISTANCE * way
 
 
 def first_view(calibration: Calibration, scale: PageScale) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:

@@ -28,11 +28,7 @@ FIT_WORDS = {
 
 HULL, PREVIEW = "hull.ply", "preview.ply"
 SHOWN = (LOG, LOCK, CALIBRATION, PREVIEW, HULL, MESH, FIELDS, THUMBS, REQUESTS_FOLDER)  # on a page
-AFTER_MESH = (
-    "detail",
-    "report",
-    "done",
-)  # stages that find this run's mesh.ply written; before, it may be an older run's
+AFTER_MESH = ("detail", "report", "done")  # stages that find this run's mesh.ply; before, it may be an older run's
 
 
 @dataclass(frozen=True)

@@ -111,10 +111,7 @@ class GuardedServer(viser.ViserServer):
             RuntimeError: the guard does not fit this version of viser.
         """
         self.token = "" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)  # of the address; "": none needed
-        with (
-            _guarded_handshakes(host, self.token, stage, title) as guards,
-            contextlib.redirect_stdout(io.StringIO()),
-        ):
+        with _guarded_handshakes(host, self.token, stage, title) as guards, contextlib.redirect_stdout(io.StringIO()):
             super().__init__(host=host, port=port, verbose=False)
         if not guards:  # another viser, which opens its socket in another way
             self.stop()

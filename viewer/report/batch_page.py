@@ -67,10 +67,13 @@ def write_thumbnail(run_dir: Path) -> None:
 
 def _row(folder: Path, task: Task, outcome: Outcome | None) -> str:
     """One capture: its cells, each with the key that it is sorted by."""
-    state, kind, order = _state(outcome)
-    size, extent = _size(outcome)
-    used, total = _photos(outcome)
-    guess = guessed_share(outcome.report) if outcome else None
+    report, notes = (outcome.report, _notes(outcome)) if outcome else ({}, [])
+    state, kind, order = _state(outcome, notes)
+    told = notes[0] + (f" (and {len(notes) - 1} more)" if len(notes) > 1 else "") if notes else ""
+    extents = report.get("mesh", {}).get("size")
+    size = size_text(np.array(extents, float), str(report.get("unit", "scene"))) if extents else ""
+    photos = [photo for photo in report.get("photos", []) if photo.get("role") == "lit"]
+    used, guess = sum(bool(photo.get("used")) for photo in photos), guessed_share(report)
     picture = ""
     if is_regular(folder / task.name / THUMBNAIL):
         picture = f'<img src="{html.escape(task.name)}/{THUMBNAIL}" alt="">'
@@ -82,45 +85,24 @@ def _row(folder: Path, task: Task, outcome: Outcome | None) -> str:
         (picture, 0, ""),
         (f"<b>{link}</b>", task.name, ""),
         (f"<b>{state}</b>", order, kind),
-        (html.escape(_to_know(outcome)), len(_notes(outcome)), ""),
-        (size, extent, ""),
-        (f"{used} of {total}" if total else "", used, ""),
+        (html.escape(told), len(notes), ""),
+        (size, max(extents) if extents else 0.0, ""),
+        (f"{used} of {len(photos)}" if photos else "", used, ""),
         (f"{100 * guess:.0f} %" if guess is not None else "", -1 if guess is None else guess, ""),
         (duration_text(seconds) if seconds >= 0 else "", seconds, ""),
     ]
     return "<tr>" + "".join(f'<td class="{c}" data-key="{html.escape(str(k))}">{t}</td>' for t, k, c in cells) + "</tr>"
 
 
-def _state(outcome: Outcome | None) -> tuple[str, str, int]:
+def _state(outcome: Outcome | None, notes: Sequence[str]) -> tuple[str, str, int]:
     """In a word, its colour, and its place when sorted: what needs a person comes first."""
     if outcome is None:
         return "waiting", "", 2
     if outcome.exit_code:
         return "failed", "failed", 0
-    return ("done, with remarks", "noted", 1) if _notes(outcome) else ("done", "done", 3)
+    return ("done, with remarks", "noted", 1) if notes else ("done", "done", 3)
 
 
-def _notes(outcome: Outcome | None) -> list[str]:
-    if outcome is None:
-        return []
-    if outcome.exit_code:
-        return [outcome.sentence]
-    return [str(line) for line in outcome.report.get("warnings", [])]
-
-
-def _to_know(outcome: Outcome | None) -> str:
-    """The first of what is to be said, and how much more there is."""
-    notes = _notes(outcome)
-    return notes[0] + (f" (and {len(notes) - 1} more)" if len(notes) > 1 else "") if notes else ""
-
-
-def _size(outcome: Outcome | None) -> tuple[str, float]:
-    extents = outcome.report.get("mesh", {}).get("size") if outcome else None
-    if not outcome or not extents:
-        return "", 0.0
-    return size_text(np.array(extents, float), str(outcome.report.get("unit", "scene"))), max(extents)
-
-
-def _photos(outcome: Outcome | None) -> tuple[int, int]:
-    photos = [p for p in (outcome.report.get("photos", []) if outcome else []) if p.get("role") == "lit"]
-    return sum(bool(p.get("used")) for p in photos), len(photos)
+def _notes(outcome: Outcome) -> list[str]:
+    """What is to be said of a capture."""
+    return [outcome.sentence] if outcome.exit_code else [str(line) for line in outcome.report.get("warnings", [])]

@@ -79,10 +79,7 @@ def _shading_numbers(facts: dict[str, Any]) -> list[tuple[str, str]]:
     return [
         (f"{facts['photos_used']} of {facts['photos']}", "Photos that can be used."),
         (f"{spread:.0f}°", "Typical angle of the lights to the plane that they come closest to; above 9° is good."),
-        (
-            f"{facts['clipped_share']:.1%} / {facts['dark_share']:.0%}",
-            "The object's samples clipped / nearly black.",
-        ),
+        (f"{facts['clipped_share']:.1%} / {facts['dark_share']:.0%}", "The object's samples clipped / nearly black."),
         (f"{len(facts['photos_of_another_power'])}", "Photos brighter or darker than their lights say."),
         (f"{facts['reflectance']:.0%}", "Light that the object mirrors from the front: its gloss."),
     ]
@@ -149,26 +146,15 @@ def back_picture(photo: UInt8[np.ndarray, "height width 3"], read: dict[str, Any
         colour = CHOSEN if is_chosen else LED if k == 0 else CANDIDATE
         x, y = map(int, np.round(place - low))
         cv2.circle(part, (x, y), round(0.08 * reach), colour, thick, cv2.LINE_AA)
-        cv2.putText(
-            part,
-            "LED" if k == 0 else str(k),
-            (x + round(0.1 * reach), y),
-            FONT,
-            0.005 * reach,
-            colour,
-            thick,
-            cv2.LINE_AA,
-        )
+        words, beside = "LED" if k == 0 else str(k), (x + round(0.1 * reach), y)
+        cv2.putText(part, words, beside, FONT, 0.005 * reach, colour, thick, cv2.LINE_AA)
     return part
 
 
 def _further(checked: CaptureCheck) -> str:
     """Return lights, shadows and photos of a further view."""
     pictures = doc.row(
-        doc.figure(
-            coverage(checked.calibration, checked.cover.centre),
-            "From the object: overhead is in the middle",
-        ),
+        doc.figure(coverage(checked.calibration, checked.cover.centre), "From the object: overhead is in the middle"),
         _shadow_figure(checked.cover),
     )
     return doc.section(checked.name, "Another place of the tripod.", pictures + _photo_table(checked))
@@ -191,11 +177,9 @@ def _place(light: Light, checked: CaptureCheck) -> list[str]:
     if not light.used:
         return ["not used", "", "", ""]
     centre, unit = checked.cover.centre, "mm" if checked.calibration.unit == "mm" else ""
-    way = light.direction if light.position is None else light.position - centre
-    assert way is not None
-    length = float(np.linalg.norm(way))
+    way, length = light.seen_from(centre)
     side = side_in_words(float(np.arctan2(way[1], way[0])), checked.calibration, centre)
-    elevation = f"{np.degrees(np.arcsin(np.clip(way[2] / length, -1, 1))):.0f}°"
+    elevation = f"{np.degrees(np.arcsin(np.clip(way[2], -1, 1))):.0f}°"
     if light.position is None:
         return [side, elevation, "far", ""]
     return [side, elevation, f"{length:.3g} {unit}".strip(), f"{2 * np.linalg.norm(light.sigma):.2g} {unit}".strip()]

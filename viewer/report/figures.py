@@ -138,14 +138,12 @@ def curves(x: Float[np.ndarray, " n"], series: Mapping[str, Float[np.ndarray, " 
         label = f"{x.min() + share * span:.3g}"
         parts.append(text(left + share * (width - left), height - bottom + 18, label, anchor))
     parts.append(text((left + width) / 2, height - 8, x_label))
+    legend = ""
     for (name, y_values), colour in zip(series.items(), CURVE_COLOURS * len(series), strict=False):
+        legend += f'<span class="key"><i style="background:{colour}"></i>{html.escape(name)}</span>'
         title = f"<title>{html.escape(name)}</title>"
         good = np.isfinite(y_values) & (y_values > 0)
         u = left + (width - left) * (x[good] - x.min()) / span
         points = " ".join(f"{a:.1f},{at_y(b):.1f}" for a, b in zip(u, y_values[good], strict=True))
         parts.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="2">{title}</polyline>')
-    legend = "".join(
-        f'<span class="key"><i style="background:{colour}"></i>{html.escape(name)}</span>'
-        for name, colour in zip(series, CURVE_COLOURS * len(series), strict=False)
-    )
     return f'{svg(width, height, parts, "Curves")}<div class="legend">{legend}</div>'

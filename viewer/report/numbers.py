@@ -115,14 +115,8 @@ def lights_part(calibration: Calibration | None, mesh: trimesh.Trimesh | None) -
     above = ""
     if any(light.position is not None for light in calibration.lights):
         drawing = lights_from_above(calibration, None if mesh is None else mesh.bounds)
-        above = doc.figure(
-            drawing,
-            "From above; ellipses larger than the dots are two standard deviations",
-        )
-    polar = doc.figure(
-        coverage(calibration, centre),
-        f"{note} Middle: straight above; rim: level with the object.",
-    )
+        above = doc.figure(drawing, "From above; ellipses larger than the dots are two standard deviations")
+    polar = doc.figure(coverage(calibration, centre), f"{note} Middle: straight above; rim: level with the object.")
     rows = [_light_row(light, unit) for light in calibration.lights]
     misfits = calibration.residuals.get("shading_rms_by_photo", {})
     rows = [(*row[:5], _plainly(misfits.get(row[0], "")), row[5]) for row in rows]
@@ -137,14 +131,11 @@ def lights_part(calibration: Calibration | None, mesh: trimesh.Trimesh | None) -
 
 def _light_row(light: Light, unit: str) -> tuple[str, ...]:
     """± is one standard deviation in space: the three axes together."""
-    spread = float(np.linalg.norm(light.sigma))
-    remark = light.reason if light.used else f"not used: {light.reason}"
-    if light.position is not None:
-        places = tuple(f"{v:.1f}" if unit == "mm" else f"{v:.4g}" for v in light.position)
-        return (light.photo, *places, f"{spread:.2g}" if spread else "given", remark)
-    assert light.direction is not None
-    places = tuple(f"{v:.3f}" for v in light.direction)
-    return (light.photo, *places, f"{np.degrees(spread):.2g}" if spread else "given", remark)
+    spread, is_point = float(np.linalg.norm(light.sigma)), light.position is not None
+    digits = ".3f" if not is_point else ".1f" if unit == "mm" else ".4g"
+    places = (f"{v:{digits}}" for v in light.homogeneous()[:3])
+    known = f"{spread if is_point else np.degrees(spread):.2g}" if spread else "given"
+    return (light.photo, *places, known, light.reason if light.used else f"not used: {light.reason}")
 
 
 def curves_part(log: Sequence[Mapping[str, Any]], fit: Mapping[str, Any]) -> str:

@@ -184,9 +184,8 @@ def photos_part(
 ) -> str:
     """Return the part about the photos, with the reason for each that was not used."""
     first = next((p["view"] for p in photos if p.get("view")), None)
-    rows = [
-        (_called(p, first), bool(p.get("used", True)), str(p.get("reason") or "")) for p in photos
-    ]  # of several views: with the view's name, but for the first one's
+    # of several views: with the view's name, but for the first one's
+    rows = [(_called(p, first), bool(p.get("used", True)), str(p.get("reason") or "")) for p in photos]
     if not rows and calibration is not None:
         rows = [(light.photo, light.used, light.reason) for light in calibration.lights]
     if not rows:

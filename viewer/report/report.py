@@ -27,14 +27,7 @@ from viewer.display.run_follower import RunFollower, status
 from viewer.report import document as doc
 from viewer.report.check_page import KINDS
 from viewer.report.numbers import calibration_part, cost_part, curves_part, findings, lights_part
-from viewer.report.pictures import (
-    comparison_part,
-    guess_facts,
-    maps_part,
-    mesh_pictures,
-    photos_part,
-    size_facts,
-)
+from viewer.report.pictures import comparison_part, guess_facts, maps_part, mesh_pictures, photos_part, size_facts
 
 T = TypeVar("T")
 SETTINGS = tuple(setting.name for setting in fields(RunOptions))
@@ -91,18 +84,11 @@ def read_results(run_dir: Path) -> Results:
         log=follower.log(),
         calibration=calibration,
         mesh=attempt(MESH, lambda: read_mesh(run_dir / MESH), None),
-        fields=None if calibration is None else attempt(FIELDS, lambda: _fields_of(run), None),
+        fields=None if calibration is None else attempt(FIELDS, lambda: run.calibration and run.fields, None),
         maps=attempt(DEPTH, lambda: read_maps(run_dir, size), None),
         thumbs={Path(name).stem: picture for name, picture in thumbs.items()},
         problems=problems,
     )
-
-
-def _fields_of(run: StoredRun) -> SolvedScene:
-    """Return the solved scene, if the calibration is of the same one."""
-    fields = run.fields
-    assert run.calibration  # which is compared with it
-    return fields
 
 
 def report_page(results: Results) -> str:

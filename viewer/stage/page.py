@@ -22,20 +22,8 @@ from reconstruct.stored_run.stage_pack import STAGE_PACK, StagePack, addressed, 
 from reconstruct.stored_run.stored_run import FIELDS, MESH, StoredRun
 from viewer.report.document import as_address, hash_of
 
-SCRIPTS = (
-    "vectors",
-    "scene",
-    "state",
-    "gpu",
-    "passes",
-    "renderer",
-    "pick",
-    "overlay",
-    "notes",
-    "hands",
-    "panel",
-    "main",
-)
+SCRIPTS = ("vectors", "scene", "state", "gpu", "passes", "renderer")
+SCRIPTS += ("pick", "overlay", "notes", "hands", "panel", "main")
 SHADERS = ("surface.vert", "surface.frag", "depth.frag", "full.vert", "light.frag", "blur.frag", "show.frag")
 SHADERS += ("lines.vert", "lines.frag")
 IMPORTED, EXPORTED = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL), re.compile(r"^export ", re.MULTILINE)
@@ -94,15 +82,6 @@ def write_stage(run_dir: Path) -> None:
         temporary.write_bytes(content)
 
 
-def stage_page(run_dir: Path) -> str:
-    """Return the page of a finished run with everything in it.
-
-    Raises:
-        UserError: the run is not finished, or a file of it cannot be used.
-    """
-    return page_of(run_dir, stage_pack(run_dir))
-
-
 def page_of(run_dir: Path, pack: StagePack, saves: str = "", home: str = "") -> str:
     """Return the page of a run, whose packed stage this is, with its title and document; see `page_html`.
 
@@ -122,12 +101,7 @@ def _fault(run_dir: Path) -> str:
 
 
 def page_html(
-    name: str,
-    pack: StagePack,
-    document: dict[str, Any] | None = None,
-    saves: str = "",
-    home: str = "",
-    fault: str = "",
+    name: str, pack: StagePack, document: dict[str, Any] | None = None, saves: str = "", home: str = "", fault: str = ""
 ) -> str:
     """Return the page's HTML.
 

@@ -3,7 +3,6 @@
 A first look is the helper's; a verdict is a process of its own, one at a time, made again when the photos have changed.
 """
 
-import contextlib
 import hashlib
 import subprocess
 import time
@@ -53,16 +52,13 @@ class Checks:
 
     def state(self, capture: Path) -> dict[str, Any]:
         """Return the newest verdict, why none can be made, and whether one is being made."""
-        place = self._place(capture)
-        found: dict[str, Any] = {"verdict": "", "sentence": "", "reasons": [], "advice": [], "lights": [], "error": ""}
-        found["numbers"] = {}
-        with contextlib.suppress(UserError):
-            found |= {key: value for key, value in read_check(place / CHECK).items() if key in found}
-        with contextlib.suppress(UserError):
-            said = str(read_check(place / REFUSED).get("sentence", ""))
-            found["error"] = without_folder(said, capture, "this capture")
+        found: dict[str, Any] = {"verdict": "", "sentence": "", "numbers": {}}
+        found |= {name: [] for name in ("reasons", "advice", "lights")}
+        found |= {key: value for key, value in self._kept(capture, CHECK).items() if key in found}
+        said = str(self._kept(capture, REFUSED).get("sentence", ""))
         is_running = self._process is not None and self._process[0] == capture
-        return found | {"is_running": is_running, "is_old": self._made_of(capture) != self._mark(capture)}
+        found |= {"error": without_folder(said, capture, "this capture"), "is_running": is_running}
+        return found | {"is_old": self._made_of(capture) != self._mark(capture)}
 
     def ask(self, capture: Path) -> None:
         """Ask for a verdict now."""
@@ -137,10 +133,14 @@ class Checks:
             return False
 
     def _made_of(self, capture: Path) -> str:
+        return str(self._kept(capture, REFUSED).get("mark", ""))
+
+    def _kept(self, capture: Path, name: str) -> dict[str, Any]:
+        """Return a document of the newest verdict; empty where there is none that can be read."""
         try:
-            return str(read_check(self._place(capture) / REFUSED).get("mark", ""))
+            return read_check(self._place(capture) / name)
         except UserError:
-            return ""
+            return {}
 
     def _place(self, capture: Path) -> Path:
         return self._folder / hashlib.sha256(str(capture).encode()).hexdigest()[:16]

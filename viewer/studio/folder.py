@@ -8,8 +8,10 @@ import os
 import secrets
 import shutil
 import time
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from hashlib import sha256
+from itertools import count
 from pathlib import Path
 
 from capture.errors import CaptureError, UserError
@@ -111,16 +113,14 @@ class StudioFolder:
         Raises:
             CaptureError: the title has no letter.
         """
-        capture = _made(self.root / CAPTURES / as_name(title, "capture").replace(" ", "-"))
+        capture = _unused(self.root / CAPTURES / as_name(title, "capture").replace(" ", "-"))
+        capture.mkdir(parents=True)
         keep_title(capture, title)
         return capture
 
     def new_run(self, capture: Path, preset: str, taken: set[str]) -> Path:
         """Return a folder for a new run of a capture, which does not exist yet; names in `taken` are promised."""
-        name = f"{capture.name}-{preset}"
-        names = {path.name for path in self._folders(self.root / RUNS)} | taken
-        number = next(k for k in range(1, len(names) + 2) if (name if k == 1 else f"{name}-{k}") not in names)
-        return self.root / RUNS / (name if number == 1 else f"{name}-{number}")
+        return _unused(self.root / RUNS / f"{capture.name}-{preset}", taken)
 
     # --- folders that a person adds ----------------------------------------------------------------------------------
 
@@ -208,16 +208,10 @@ def _found(key: str, places: dict[str, Path], kind: str, others: dict[str, Path]
     raise CaptureError(f"{key[:80]!r} is {is_what}. Go back to all captures.")
 
 
-def _made(path: Path) -> Path:
-    for number in range(1, MOST_FOLDERS):
-        place = path if number == 1 else path.with_name(f"{path.name}-{number}")
-        place.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            place.mkdir()
-        except FileExistsError:
-            continue
-        return place
-    raise CaptureError(f"there are {MOST_FOLDERS} captures named {path.name}. Choose another name.")
+def _unused(path: Path, taken: Collection[str] = ()) -> Path:
+    """Return this path, or with the first number from 2 behind it, that is not there and whose name is not taken."""
+    places = (path if number == 1 else path.with_name(f"{path.name}-{number}") for number in count(1))
+    return next(place for place in places if place.name not in taken and not os.path.lexists(place))
 
 
 @dataclass(frozen=True)

@@ -276,7 +276,13 @@ def example_photos() -> Path:
 
 
 @cache
-def example_page() -> bytes | None:
-    """Return the page of the example's result; None where it is of another version of the stage."""
+def example_page() -> bytes:
+    """Return the page of the example's result.
+
+    Raises:
+        CaptureError: it is damaged, or of another version of the stage.
+    """
     pack = opened_pack(EXAMPLE_RESULT)
-    return None if pack is None else page_html("Spot", pack).encode()
+    if pack is None:
+        raise CaptureError('The result that came with this installation is damaged. "Try the example" makes another.')
+    return page_html("Spot", pack).encode()

@@ -71,8 +71,8 @@ class Saving:
             CaptureError: there is no such run or format.
         """
         out, arguments = self._request(key, name, size)
-        row = self._row(out)
-        if row is None or row["error"]:
+        one = self._asked.get(out)
+        if one is None or (row := one.row()) is None or row["error"]:
             helper = self._films if "frames" in FORMATS[name].takes else self._files
             self._asked[out] = Asked(key, name, size, out, helper, helper.ask("save", **arguments))
 
@@ -83,8 +83,8 @@ class Saving:
             CaptureError: it was not made, or the run has changed since.
         """
         out, _ = self._request(key, name, size)
-        row = self._row(out)
-        if row is None or not row["file"]:
+        one = self._asked.get(out)
+        if one is None or (row := one.row()) is None or not row["file"]:
             raise CaptureError("This file is not there. Make it first.")
         return out / row["file"]
 
@@ -112,10 +112,6 @@ class Saving:
             for place in self._place.iterdir():
                 if place not in self._asked or self._asked[place].task.done():
                     shutil.rmtree(place, ignore_errors=True)
-
-    def _row(self, out: Path) -> dict[str, Any] | None:
-        one = self._asked.get(out)
-        return None if one is None else one.row()
 
     def _request(self, key: str, name: str, size: str) -> tuple[Path, dict[str, Any]]:
         """Return the folder for a file, whose name changes with what it is made of, and the task that makes it."""

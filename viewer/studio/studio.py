@@ -140,12 +140,8 @@ class Studio:
             CaptureError: the capture has no such photo.
         """
         capture = self.folder.capture(key)
-        photos = _named(capture, photos_of(capture))
-        if photo == "" and photos:
-            photo = next(reversed(photos))
-        if photo not in photos:
-            raise CaptureError("This photo is gone.")
-        path = photos[photo]
+        photos = photos_of(capture)
+        path = photos[-1] if photo == "" and photos else _named(capture, photos, photo)
         out = self.folder.kept / "pictures" / f"{mark_of(path)}.jpg"
         if is_regular(out):
             return out
@@ -235,10 +231,8 @@ class Studio:
     def delete_photo(self, key: str, photo: str) -> None:
         """Move one photo or clip of a capture into the trash."""
         capture = self.folder.capture(key)
-        names = _named(capture, (*photos_of(capture), *clips_of(capture)))
-        if photo not in names:
-            raise CaptureError("This photo is gone.")
-        self.trash.put(names[photo], f"{photo} of {title_of(capture)}")
+        file = _named(capture, (*photos_of(capture), *clips_of(capture)), photo)
+        self.trash.put(file, f"{photo} of {title_of(capture)}")
 
     def set_board(self, key: str, spec: str) -> None:
         """Say which board the photos show."""
@@ -247,8 +241,7 @@ class Studio:
     def set_role(self, key: str, photo: str, role: str) -> None:
         """Say what a photo is."""
         capture = self.folder.capture(key)
-        if photo not in _named(capture, photos_of(capture)):
-            raise CaptureError("This photo is gone.")
+        _named(capture, photos_of(capture), photo)
         set_role(capture, photo, role)
 
     def start_run(self, key: str, preset: str) -> str:
@@ -297,6 +290,13 @@ class Studio:
                 (self.folder.kept / f"fault_{step.strip('_')}.txt").write_text(text, "utf-8", "replace")
 
 
-def _named(capture: Path, files: Iterable[Path]) -> dict[str, Path]:
-    """Return files of a capture by their paths relative to it."""
-    return {file.relative_to(capture).as_posix(): file for file in files}
+def _named(capture: Path, files: Iterable[Path], name: str) -> Path:
+    """Return one of these files of a capture by its path relative to it.
+
+    Raises:
+        CaptureError: there is none of this name.
+    """
+    found = next((file for file in files if file.relative_to(capture).as_posix() == name), None)
+    if found is None:
+        raise CaptureError("This photo is gone.")
+    return found

@@ -40,11 +40,7 @@ POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
     "media-src 'self' blob:; frame-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 )
-OWN_HEADERS = SAFE_HEADERS | {
-    "Content-Security-Policy": POLICY,
-    "X-Frame-Options": "DENY",
-    "Cache-Control": "no-store",
-}
+OWN_HEADERS = SAFE_HEADERS | {"Content-Security-Policy": POLICY, "X-Frame-Options": "DENY", "Cache-Control": "no-store"}
 # Of a page made of a run's or capture's content: it gets no origin, so it reaches nothing of the studio.
 FRAMED_POLICY = (
     "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data: blob:; "

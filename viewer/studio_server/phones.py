@@ -156,12 +156,17 @@ class Phones:
         with self._lock:
             self._door = None
             self._file.unlink(missing_ok=True)
-            self._close()
+            self.close()
 
     def close(self) -> None:
         """End the listeners; what is open is remembered."""
         with self._lock:
-            self._close()
+            for server in self._servers:
+                server.should_exit = True
+            if threading.current_thread() not in self._threads:
+                for thread in self._threads:
+                    thread.join(5.0)
+            self._servers, self._threads = [], []
 
     def join(self, token: str, name: str) -> Phone:
         """Let a phone in that shows the code's secret; the code is used up.
@@ -257,14 +262,6 @@ class Phones:
             thread.start()
             self._threads.append(thread)
         self._note()
-
-    def _close(self) -> None:
-        for server in self._servers:
-            server.should_exit = True
-        if threading.current_thread() not in self._threads:
-            for thread in self._threads:
-                thread.join(5.0)
-        self._servers, self._threads = [], []
 
     def _note(self) -> None:
         if self._door is not None:

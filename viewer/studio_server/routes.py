@@ -50,9 +50,7 @@ def owner_app(studio: Studio, phones: Phones) -> Starlette:
         *file_routes("index.html"),
         *_questions(studio, phones),
         *_changes(studio, phones),
-        *Uploads(
-            studio.parts, lambda _, key: studio.folder.key(studio.folder.capture(key)), lambda _: "owner"
-        ).routes(),
+        *Uploads(studio.parts, lambda _, key: _existing(studio, key), lambda _: "owner").routes(),
     ]
     return Starlette(routes=routes, exception_handlers=sentences(studio.folder.root))
 
@@ -82,7 +80,7 @@ def _questions(studio: Studio, phones: Phones) -> list[Route]:
         ask("/api/saved", lambda r: studio.saving.asked(_key(r))),
         ask("/download", lambda r: _download(studio.saving.file(_key(r), *(r.query_params.get(n, "") for n in SAVED)))),
         ask("/stage/{key:path}/", lambda r: _stage(studio, r)),
-        ask("/example/", lambda _: _example()),
+        ask("/example/", lambda _: Response(example_page(), media_type=HTML, headers=STAGED)),
         ask("/report", lambda r: _framed(studio.folder.run(_key(r)) / "report.html")),
         ask("/check_page", lambda r: _framed(studio.checks.page(studio.folder.capture(_key(r))))),
     ]
@@ -133,13 +131,6 @@ def _stage(studio: Studio, request: Request) -> Response:
         return Response()
     run = studio.folder.run(request.path_params["key"])
     return Response(page_of(run, pack, "frame"), media_type=HTML, headers=STAGED)
-
-
-def _example() -> Response:
-    page = example_page()
-    if page is None:
-        raise CaptureError('The result that came with this installation is damaged. "Try the example" makes another.')
-    return Response(page, media_type=HTML, headers=STAGED)
 
 
 async def _keep_document(studio: Studio, request: Request) -> Response:

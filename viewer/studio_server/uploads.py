@@ -1,4 +1,4 @@
-"""Files under way over HTTP: tus 1.0.0 with creation and termination (https://tus.io/protocols/resumable-upload).
+"""Files under way over HTTP: tus 1.0.0 with creation (https://tus.io/protocols/resumable-upload).
 
 The owner's page and the phones' use the same routes; who may send to which capture is the caller's.
 """
@@ -34,9 +34,7 @@ class Uploads:
         """Return the routes below /upload."""
         return [
             Route("/upload", self.create, methods=["POST"]),
-            Route("/upload/{id}", self.state, methods=["HEAD"]),
-            Route("/upload/{id}", self.append, methods=["PATCH"]),
-            Route("/upload/{id}", self.drop, methods=["DELETE"]),
+            Route("/upload/{id}", self.answer, methods=["HEAD", "PATCH"]),
         ]
 
     async def create(self, request: Request) -> Response:
@@ -47,19 +45,17 @@ class Uploads:
         part = self._parts.begin(capture, values.get("filename", ""), size, role, self._sender(request))
         return Response(status_code=201, headers=TUS | {"Location": f"/upload/{part.id}"})
 
-    async def state(self, request: Request) -> Response:
-        """Say how much of a file is here."""
+    async def answer(self, request: Request) -> Response:
+        """Say how much of a file is here, or take its next piece."""
         part = self._part(request)
         if part is None:
             return Response(status_code=404, headers=TUS)
+        if request.method == "PATCH":
+            return await self._append(request, part)
         part = await self._finished(part)  # a sender that was told of a full disk asks here before it goes on
         return Response(headers=TUS | {"Upload-Length": str(part.size)} | self._where(part))
 
-    async def append(self, request: Request) -> Response:
-        """Take the next piece of a file."""
-        part = self._part(request)
-        if part is None:
-            return Response(status_code=404, headers=TUS)
+    async def _append(self, request: Request, part: Part) -> Response:
         if request.headers.get("Content-Type") != PIECE:
             return Response(status_code=415, headers=TUS)
         try:
@@ -70,13 +66,6 @@ class Uploads:
             return Response(status_code=400, headers=TUS)
         part = await self._finished(part)
         return Response(status_code=204, headers=TUS | self._where(part))
-
-    async def drop(self, request: Request) -> Response:
-        """Forget a file."""
-        part = self._part(request)
-        if part is not None:
-            self._parts.drop(part)
-        return Response(status_code=204, headers=TUS)
 
     async def _finished(self, part: Part) -> Part:
         """The file, in its capture if it is whole."""

@@ -1,6 +1,6 @@
 // One capture: its board, its photos as they arrive, the verdict, and the start of a run.
 
-import { PRESETS, about, ask as question, attempt, bytes, change, day, dialog, duration, failure, h, key, picture, plural, presetWords, rename, toast } from "./dom.js";
+import { PRESETS, about, ask as question, attempt, bytes, change, changed, day, dialog, duration, failure, h, key, picture, plural, presetWords, rename, toast } from "./dom.js";
 import { boardOnScreen, printLink } from "./board.js";
 import { dome } from "./hemisphere.js";
 import { Sender, chooser, complaint, dropped, sending, unused } from "./upload.js";
@@ -13,7 +13,7 @@ const senders = new Map(); // they go on while another view is shown
 export function capture(name, again) {
   if (!senders.has(name)) senders.set(name, new Sender(name, () => window.dispatchEvent(new Event("sent"))));
   const sender = senders.get(name);
-  const phone = phones(name, again), take = (files) => sender.add(files);
+  const phone = phones(name, again), act = changed(again), take = (files) => sender.add(files);
   let boards = null, times = [], timed = -1, preset = "draft", isOver = false;
   const loud = voice(again);
   const view = { pause: 1000 };
@@ -54,7 +54,7 @@ export function capture(name, again) {
       phone.panel(), sending(sender), row.stalled > 0 && stalled(row),
       row.refused.length > 0 && h("div", { class: "bad small" }, h("p", {}, "Not taken:"),
         h("ul", { class: "plain" }, row.refused.slice(-5).map((one) => h("li", {}, complaint(one.name, one.why), " ",
-          h("button", { onclick: () => attempt(async () => { await change("dismiss", { key: row.key, part: one.id }); again(); }) }, "Dismiss")))),
+          h("button", { onclick: () => act("dismiss", { key: row.key, part: one.id }) }, "Dismiss")))),
         row.refused.length > 5 && h("p", {}, `and ${row.refused.length - 5} more.`)),
       row.photos.length + row.clips.length > 0 && h("p", { class: "quiet" }, row.counts.words),
       bad.length > 0 && h("p", { class: "warn" }, unused(bad)),
@@ -66,7 +66,7 @@ export function capture(name, again) {
   function stalled(row) {
     return h("div", { class: "warn", key: "stalled" },
       h("p", {}, `${plural(row.stalled, "file")} stopped in the middle: the phone or page that sends ${row.stalled === 1 ? "it" : "them"} has left, or lost the network. Sending goes on by itself when it is back.`),
-      h("button", { onclick: () => attempt(async () => { await change("go_on_without", { key: row.key }); again(); }) }, "Go on without"));
+      h("button", { onclick: () => act("go_on_without", { key: row.key }) }, "Go on without"));
   }
 
   /** What a photo may show. Of one in the folder of a role the folder says it, and another choice moves it there. */
@@ -82,10 +82,7 @@ export function capture(name, again) {
       picture(`/api/picture?key=${key(row.key)}&photo=${key(photo.name)}`, photo.name),
       h("span", { class: "name" }, photo.name.split("/").pop()),
       photo.remarks.length > 0 && h("span", { class: photo.drop ? "bad" : "warn" }, photo.remarks[0][0]),
-      h("select", { "aria-label": `What ${photo.name} shows`, value: photo.role, onchange: (event) => attempt(async () => {
-        await change("role", { key: row.key, photo: photo.name, role: event.target.value });
-        again();
-      }) }, roles(photo)),
+      h("select", { "aria-label": `What ${photo.name} shows`, value: photo.role, onchange: (event) => act("role", { key: row.key, photo: photo.name, role: event.target.value }) }, roles(photo)),
       h("button", { "aria-label": `Delete ${photo.name}`, onclick: () => attempt(async () => {
         await change("delete_photo", { key: row.key, photo: photo.name });
         toast(`${photo.name} is in the trash.`);
@@ -96,7 +93,7 @@ export function capture(name, again) {
   function boardPanel(row) {
     const known = boards.some((board) => board.spec === row.board);
     const list = known ? boards : [...boards, { spec: row.board, title: row.board, about: "As session.toml says." }];
-    const choose = (spec) => attempt(async () => { await change("board", { key: row.key, board: spec }); again(); });
+    const choose = (spec) => act("board", { key: row.key, board: spec });
     const printed = row.board.startsWith("paper") || row.board === "card" ? "" : row.board;
     const chosen = list.find((board) => board.spec === row.board).title, isClosed = row.photos.length + row.clips.length > 0;
     const place = (...parts) => (isClosed ? h("details", { class: "panel" }, h("summary", {}, h("h2", {}, `Board: ${chosen}`)), parts)
@@ -115,7 +112,7 @@ export function capture(name, again) {
   const describe = (row) => attempt(async () => {
     const words = "Such as charuco:5x7:30:22:DICT_4X4_50 (squares, mm of a square, mm of a marker, dictionary) or checkerboard:9x6:24.25 (inner corners, mm of a square).";
     const spec = await dialog("Another board", words, "Use it", { text: row.board });
-    if (spec !== null) { await change("board", { key: row.key, board: spec.trim() }); again(); }
+    if (spec !== null) await act("board", { key: row.key, board: spec.trim() });
   });
 
   function verdictPanel(row) {
@@ -134,10 +131,7 @@ export function capture(name, again) {
       lights.length > 0 && dome(lights),
       lights.length > 0 && h("p", { class: "small quiet" }, "The lights seen from above: low ones at the rim. No light yet where it glows."),
       row.photos.length > 0 && loud.control(),
-      h("div", { class: "bar" }, h("button", { disabled: check.is_running || row.photos.length + row.clips.length < 2, onclick: () => attempt(async () => {
-        await change("check", { key: row.key });
-        again();
-      }) }, "Check now"),
+      h("div", { class: "bar" }, h("button", { disabled: check.is_running || row.photos.length + row.clips.length < 2, onclick: () => act("check", { key: row.key }) }, "Check now"),
         check.sentence && h("a", { class: "button", href: `/check_page?key=${key(row.key)}`, target: "_blank", rel: "noopener" }, "All details")));
   }
 

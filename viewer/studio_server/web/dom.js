@@ -87,6 +87,9 @@ export async function attempt(task) {
   try { return await task(); } catch (error) { toast(error.message, true); return undefined; }
 }
 
+/** Ask for a change, and draw the page anew by `again`. */
+export const changed = (again) => (name, values) => attempt(async () => { await change(name, values); again(); });
+
 export function toast(words, isBad = false) {
   const element = h("div", { class: isBad ? "toast bad" : "toast" }, words);
   document.getElementById("toasts").append(element);

@@ -1,6 +1,6 @@
 // All captures and runs of the folder.
 
-import { attempt, bytes, change, day, dialog, duration, h, key, picture, plural, presetWords, rename, toast } from "./dom.js";
+import { attempt, bytes, change, changed, day, dialog, duration, h, key, picture, plural, presetWords, rename, toast } from "./dom.js";
 import { frame, queue } from "./result.js";
 
 const WORDS = {
@@ -124,7 +124,7 @@ export function home(_, again) {
     return h("details", { class: "panel trash", key: "trash" }, h("summary", {}, `Trash: ${plural(deleted.length, "thing")}, ${bytes(total)}`),
       h("ul", { class: "plain" }, deleted.map((one) => h("li", { key: one.id },
         h("span", { class: "grow" }, one.title, " ", h("span", { class: "quiet small" }, `${bytes(one.bytes)}, ${day(one.when)}`)),
-        h("button", { "aria-label": `Put back: ${one.title}`, onclick: () => attempt(async () => { await change("restore", { id: one.id }); again(); }) }, "Put back")))),
+        h("button", { "aria-label": `Put back: ${one.title}`, onclick: () => changed(again)("restore", { id: one.id }) }, "Put back")))),
       h("button", { class: "danger", onclick: () => attempt(async () => {
         if (await dialog("Empty the trash?", `${bytes(total)} are deleted for good.`, "Delete for good", { isDanger: true })) {
           toast(`${bytes(await change("empty_trash"))} freed.`);

@@ -1,6 +1,6 @@
 // Runs: those that wait for this machine, the progress of one, its result once it is finished, two results side by side.
 
-import { about, ask, attempt, bytes, change, dialog, duration, failure, h, key, plural, presetWords, rename } from "./dom.js";
+import { about, ask, attempt, bytes, change, changed, dialog, duration, failure, h, key, plural, presetWords, rename } from "./dom.js";
 import { saving } from "./save.js";
 
 /** The seconds that jobs take together; null where that is not known. */
@@ -10,7 +10,7 @@ const leftOf = (jobs) => (jobs.some((job) => job.left_s === null || job.left_s =
 export function queue(jobs, again) {
   if (!jobs.length) return null;
   const left = leftOf(jobs), told = left === null ? "how long they take is not known yet" : `all done in ${about(left)}`;
-  const act = (job, action) => attempt(async () => { await change("queue", { job: job.id, action }); again(); });
+  const act = (job, action) => changed(again)("queue", { job: job.id, action });
   return h("section", { class: "panel queue", key: "queue" }, h("h2", {}, "At work"),
     h("p", { class: "quiet" }, `One run at a time, ${jobs.length} in the queue; ${told}.`),
     h("ol", { class: "plain" }, jobs.map((job, place) => h("li", { key: job.id },
@@ -94,7 +94,7 @@ export function run(name, again) {
   }
 
   const fill = () => attempt(() => document.querySelector("iframe.result").requestFullscreen());
-  const act = (one, action) => attempt(async () => { await change("queue", { job: one.job, action }); again(); });
+  const act = (one, action) => changed(again)("queue", { job: one.job, action });
   const remove = (one) => attempt(async () => {
     if (await dialog(`Delete ${one.title}?`, "It goes into the trash, from where it can be put back.", "Delete", { isDanger: true })) {
       await change("delete", { key: one.key });
