@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 
 from reconstruct.run import presets
+from reconstruct.shading import joint_normals
 from reconstruct.source.source import LONG_SIDES
 
 SIDE = 240  # px
+NORMAL_STEPS = 20  # of 150, when few photos leave the normals of all pixels to be fitted together
 TESTS = Path(__file__).parent
 ENVIRONMENT = {"PYTHONPATH": f"{TESTS}{os.pathsep}{TESTS.parent}"}  # of a process with `brief_command`
 _RUN = """import sys, shadowgraph
@@ -34,4 +36,5 @@ def brief_drafts() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(presets, "DRAFT_LEVELS", levels)
         patch.setitem(LONG_SIDES, "draft", SIDE)
+        patch.setattr(joint_normals, "STEPS", NORMAL_STEPS)
         yield

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from brief_drafts import NORMAL_STEPS
 from flashlight_photos import looking_at
 from scipy.ndimage import label
 from synthetic import BALL, HEAP, Box, Look, Sphere, default_camera, grid_of, render
@@ -23,6 +24,7 @@ from reconstruct.initialization import choose_start
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.observer import Observer
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.shading import joint_normals
 
 LOOK = Look(with_shadow=True, with_mask=True, n_lights=24)
 
@@ -186,6 +188,7 @@ def test_a_bend_that_the_shadows_contradict_is_left_for_the_hull(monkeypatch):
         return SdfGrid(grid.values, grid.origin + torch.tensor([0.0, 0.0, raised]), grid.spacing)
 
     monkeypatch.setattr(bent_hull, "follow_normals", floats)
+    monkeypatch.setattr(joint_normals, "STEPS", NORMAL_STEPS)
     config = FitConfig(levels=(Level(32, 1, (0.5, 0.4), 4),))
     found = choose_start.HullStart((scene,), (Observer(scene),), config, lambda _: None).surface()
     low, high = torch.tensor([BALL.centre, BALL.centre]) + torch.tensor([[0.0] * 3, [0.0, 0.0, 1.6 * BALL.radius]])

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from brief_drafts import NORMAL_STEPS
 from scipy.spatial import KDTree
 from synthetic import Look, Sphere, Truth, default_camera, grid_of, render
 
@@ -18,6 +19,7 @@ from reconstruct.render.g_buffer import material_at, seen_material, surface_maps
 from reconstruct.render.joined import join_views
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.shading import joint_normals
 from reconstruct.solve.solver import fit
 
 SHAPES = (Sphere((0.0, 0.0, 30.0), 30.0, (0.7, 0.5, 0.3)), Sphere((12.0, 8.0, 60.0), 14.0, (0.3, 0.5, 0.7)))
@@ -36,6 +38,14 @@ def seen_from(azimuth: float, n_lights: int = 8, seed: int = 0, shapes=SHAPES) -
     look = Look(width=64, height=48, n_lights=n_lights, seed=seed)
     scene, truth = render(shapes, look, turned(azimuth))
     return replace(scene, view=f"view_{azimuth:.0f}"), truth
+
+
+@pytest.fixture(scope="module", autouse=True)
+def brief_normals():
+    """Six photos a view leave normals to be fitted together, many times in a solve: a few steps of that will do."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(joint_normals, "STEPS", NORMAL_STEPS)
+        yield
 
 
 @pytest.fixture(scope="module")

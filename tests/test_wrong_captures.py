@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import synthetic
+from brief_drafts import NORMAL_STEPS
 from synthetic import BALL, Box, Look, Sphere, render
 from test_crash import TINY, Stop
 
@@ -12,6 +13,7 @@ from capture.errors import UserError
 from reconstruct.check.light_coverage import shadow_cover
 from reconstruct.check.readiness import judge, refuse_hopeless
 from reconstruct.mesh.mesh import extract_mesh
+from reconstruct.shading import joint_normals
 from reconstruct.solve.solver import fit
 
 LOOK = Look(width=96, height=72, n_lights=10)
@@ -43,6 +45,7 @@ CASES = {
 def test_a_wrong_capture_is_told_before_the_solve_and_never_gives_an_empty_mesh(name, monkeypatch):
     shapes, places = CASES[name]
     monkeypatch.setattr(synthetic, "default_lights", lambda look: lights_at(places))
+    monkeypatch.setattr(joint_normals, "STEPS", NORMAL_STEPS)
     scene, truth = render(shapes, LOOK)
     verdict = judge(truth.calibration, check_stack(truth.stack, None), shadow_cover(scene))
     assert verdict.grade in ("poor", "hopeless"), verdict.sentence()

@@ -95,10 +95,10 @@ class Observer:
         A first look under an endless ground, or none, gives the albedo with which light between surfaces is found.
         """
         assert self._ground is not None
-        on_object = label_object(scene, points, normals, self._ground.mask, self._ground)
+        on_object = label_object(scene, points, normals, self._ground.mask, self._ground, first_look=True)
         albedo = self._beside_ground(on_object.albedo, normals)
         indirect = self._between_surfaces(self._solved(surface, scene, albedo, None), scene)[1]
-        if indirect is not None:
+        if indirect is not None or on_object.is_alone:
             on_object = label_object(scene, points, normals, self._ground.mask, self._ground, indirect)
         material = None if scene.ground_known else material_without_ground(scene, points, on_object)
         if material is None:

@@ -12,6 +12,7 @@ from reconstruct.appearance.lobe_fit import Indirect, from_endless_ground
 from reconstruct.labels.ground_test import GroundTest
 from reconstruct.labels.outline import dilated, local_mean
 from reconstruct.scene import Scene, grey_irradiance, grey_of
+from reconstruct.shading.joint_normals import Picture, fit_together
 from reconstruct.shading.noise import DEFAULT_NOISE, Noise
 from reconstruct.shading.normal_fit import MODEL_SHARE, Pixels, Prior, fit_normals, indirect_light, misfit
 from reconstruct.shading.normal_kernels import INDIRECT_SHARE
@@ -26,6 +27,9 @@ GRAZING = 0.15  # cosine to the light below which shading hardly determines shad
 NORMAL_SIGMA = 0.12  # rad: error of a photometric normal
 FEWEST_INLIERS, ENOUGH_INLIERS = 4.0, 10.0  # effective photos behind a normal: confidence 0 and 1
 FEWEST_SHARE, ENOUGH_SHARE = 0.3, 0.7  # of the photos, if that is fewer: then albedo and surface must help out
+OFTEN_FEW = 0.2  # of the object's pixels with fewer than FEWEST_INLIERS: then all normals are fitted together
+LIT_TOGETHER = 3.0  # effective photos behind a normal that was fitted with its neighbours: confidence 1
+MOST_SAMPLES = 1_000_000  # pixels times photos that are fitted together: 200 MB
 EXPLAINED, UNEXPLAINED = 1.0, 4.0  # misfit of a pixel up to which its labels count in full, and from which not at all
 USUAL_MISFIT = 0.25  # of the object's pixels, median; where it is larger, these two grow with it
 EDGE_SHARE = 0.25  # of the confidence on mask-edge pixels, which mix two surfaces
@@ -40,6 +44,7 @@ class ObjectLabels:
     albedo: Float[Tensor, "height width 3"]  # relative to Scene.power
     visibility: Float[Tensor, "photos height width"]
     confidence: Float[Tensor, "photos height width"]
+    is_alone: bool = False  # each pixel by itself, though so few photos light them that neighbours should help out
 
 
 def label_object(
@@ -49,6 +54,7 @@ def label_object(
     mask: Float[Tensor, "height width"],
     ground: GroundTest | None = None,
     indirect: Indirect | None = None,
+    first_look: bool = False,
 ) -> ObjectLabels:
     """Estimate normals, albedo and shadow labels of the pixels with mask > 0.5, given approximate surface points.
 
@@ -64,6 +70,7 @@ def label_object(
             decides where the photos are too few.
         ground: gives the noise and the light reflected by the ground; without it neither is known.
         indirect: irradiance of surface points by all that object and ground reflect; None: by an endless ground alone.
+        first_look: for the albedo: no pixels are fitted together, which takes ten times as long.
 
     Raises:
         ValueError: the scene has shadow pictures only.
@@ -81,17 +88,22 @@ def label_object(
     if indirect is not None and normals is not None:
         gather = partial(gather, beyond=partial(_beyond_endless_ground, points, normals, indirect, scaled))
     usual = _usual_albedo(where, gather)
-    errors = torch.zeros(len(places))
+    solved, inliers, errors = torch.zeros(len(places), 3), torch.zeros(len(places)), torch.zeros(len(places))
     for part, own in _chunks(places):
         pixels, (row, column) = gather(part), part.unbind(1)
         guess = None if normals is None else normals[row, column]
-        solved, weight = fit_normals(pixels, Prior(usual[row, column], guess))
-        errors[own] = misfit(pixels, solved)
-        trust = _normal_trust(pixels, solved, weight, usual[row, column])
-        _write(labels, scene, part, pixels, solved, weight, trust)
+        solved[own], weight = fit_normals(pixels, Prior(usual[row, column], guess))
+        inliers[own], errors[own] = weight.sum(1), misfit(pixels, solved[own])
+        trust = _normal_trust(pixels, solved[own], weight, usual[row, column])
+        _write(labels, scene, part, pixels, solved[own], weight, trust)
+    few = bool((inliers < FEWEST_INLIERS).float().mean() > OFTEN_FEW) and len(places) * len(scene.lights) < MOST_SAMPLES
+    if few and not first_look:
+        _write_together(labels, scene, places, gather(places), normals, solved, inliers)
     share = torch.where(dilated(~where, 3), EDGE_SHARE, 1.0)
-    share[tuple(places.T)] *= _explained(errors)
-    return replace(labels, normal_confidence=labels.normal_confidence * share, confidence=labels.confidence * share)
+    if not few:
+        share[tuple(places.T)] *= _explained(errors)
+    trusted = replace(labels, normal_confidence=labels.normal_confidence * share, confidence=labels.confidence * share)
+    return replace(trusted, is_alone=few and first_look)
 
 
 def _explained(errors: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
@@ -131,6 +143,33 @@ def _write(
     labels.visibility[:, row, column] = visibility.T
     labels.confidence[:, row, column] = confidence.T * (0.3 + 0.7 * trust)
     labels.albedo[row, column] = _colour(scene, pixels, places, normal, weight)
+
+
+def _write_together(
+    labels: ObjectLabels,
+    scene: Scene,
+    places: Int[Tensor, "n 2"],
+    pixels: Pixels,
+    normals: Float[Tensor, "height width 3"] | None,
+    solved: Float[Tensor, "n 3"],
+    inliers: Float[Tensor, " n"],
+) -> None:
+    """Fit the normals of all pixels together, and set the labels where a pixel's own photos are few, in place.
+
+    Args:
+        solved, inliers: of each pixel by itself: albedo * normal, and effective photos behind it.
+    """
+    assert scene.rgb is not None
+    row, column = places.unbind(1)
+    bright = pixels.usable * pixels.value / pixels.strength
+    bright = (bright / bright.amax(1, keepdim=True).clamp(min=1e-12)) ** 2
+    seen = torch.einsum("nk,knc->nc", bright, scene.rgb[:, row, column] / scene.tint[:, None])
+    picture = Picture(places, scene.directions, seen / seen.sum(-1, keepdim=True).clamp(min=1e-12))
+    guess = None if normals is None else normals[row, column]
+    joint, weight = fit_together(picture, pixels, guess, solved)
+    alone = ((inliers - FEWEST_INLIERS) / (ENOUGH_INLIERS - FEWEST_INLIERS)).clamp(0, 1)
+    trust = alone * labels.normal_confidence[row, column] + (1 - alone) * (weight.sum(1) / LIT_TOGETHER).clamp(0, 1)
+    _write(labels, scene, places, pixels, alone[:, None] * solved + (1 - alone)[:, None] * joint, weight, trust)
 
 
 def _blank(scene: Scene) -> ObjectLabels:
