@@ -2,10 +2,13 @@
 
     python benchmarks/bed.py --seed 1 --count 12 [--kind close far] [--meshes DIR] [--cache DIR] [--tree DIR]
     python benchmarks/bed.py --seed 1000 --count 40 --compare A B
+    python benchmarks/bed.py --seed 1000 --count 40 --without NAME
 
 The captures follow from kind and seed (benchmarks/bed_draws.py). Pictures and results stay in the cache: one JSON line
 for each capture and commit, so that the bed can be run in pieces. A and B are commits; what one lacks is run in a
-worktree of its own. Seeds below 1000 are for looking into. Of those from 1000 on no single capture is printed.
+worktree of its own. NAME is a mechanism of benchmarks/switches.py: the runs that are kept are done again without it,
+from their calibrations on, and compared. Seeds below 1000 are for looking into. Of those from 1000 on no single
+capture is printed.
 
 Needs the extra `generator`; with LLVM 16 or newer, named by DRJIT_LIBLLVM_PATH, it renders five times as fast.
 """
@@ -84,14 +87,22 @@ def at_rest(file: Path, folder: Path, seed: int) -> Path:
     return out
 
 
-def measured(made: Draw, cache: Path, tree: Path, commit: str, preset: str) -> Row:
-    """Render, run and score one capture; the row that is kept."""
-    capture, out = rendered(made, cache), cache / "runs" / commit / made.key()
-    arguments = ["run", str(capture), "--out", str(out), "--viewer", "off", "--force", "--preset", preset]
+def measured(made: Draw, cache: Path, tree: Path, commit: str, preset: str, without: str = "") -> Row:
+    """Render, run and score one capture; the row that is kept.
+
+    Args:
+        without: a switch; the run goes on from the calibration of the commit's own run.
+    """
+    capture, out = rendered(made, cache), cache / "runs" / place_of(commit, without) / made.key()
+    program, force = [str(tree / "shadowgraph")], ["--force"]
+    if without:
+        copy_calibration(cache / "runs" / commit / made.key(), out)
+        program, force = [str(ROOT / "benchmarks" / "switches.py"), without], []
+    arguments = ["run", str(capture), "--out", str(out), "--viewer", "off", "--preset", preset, *force]
     out.parent.mkdir(parents=True, exist_ok=True)
     with (out.parent / f"{made.key()}.log").open("w") as log:
         started = subprocess.Popen(
-            [sys.executable, str(tree / "shadowgraph"), *arguments],
+            [sys.executable, *program, *arguments],
             env=os.environ | {"PYTHONPATH": str(tree)},
             stdout=subprocess.DEVNULL,
             stderr=log,
@@ -102,6 +113,23 @@ def measured(made: Draw, cache: Path, tree: Path, commit: str, preset: str) -> R
     row = {"seed": made.seed, "kind": made.kind, "key": made.key(), "commit": commit, "preset": preset, **made.factors}
     row |= {"exit": code, "cpu_s": usage.ru_utime + usage.ru_stime}
     return row | scored(out, capture, code, (out.parent / f"{made.key()}.log").read_text(), made.factors)
+
+
+def place_of(commit: str, without: str) -> str:
+    """Return the name under which the results of a commit are kept, with all mechanisms or without one."""
+    return f"{commit}-without-{without}" if without else commit
+
+
+def copy_calibration(run: Path, out: Path) -> None:
+    """Make a run folder that stands where a finished one stood after its calibration and check."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    for name in ("calibration.json", "check.json"):
+        if (run / name).exists():
+            shutil.copy(run / name, out)
+    manifest = json.loads((run / "manifest.json").read_text())
+    manifest["finished"] = [stage for stage in manifest["finished"] if stage in ("calibrate", "check")]
+    (out / "manifest.json").write_text(json.dumps(manifest))
 
 
 def scored(out: Path, capture: Path, code: int, said: str, factors: dict[str, str]) -> Row:
@@ -153,16 +181,17 @@ def what_is_wrong(row: Row, factors: dict[str, str]) -> list[str]:
 # --- many captures ---------------------------------------------------------------------------------------------------
 
 
-def results(options: argparse.Namespace, tree: Path | None, commit: str) -> list[Row]:
+def results(options: argparse.Namespace, tree: Path | None, commit: str, without: str = "") -> list[Row]:
     """Return the rows of all wanted captures of a commit; those that are not kept yet are measured.
 
     Args:
         tree: a checkout of the commit; none: one is made when it is needed.
+        without: a switch, see `measured`.
     """
     meshes = sorted(options.meshes.glob("*.ply")) if options.meshes else []
     seeds = range(options.seed, options.seed + options.count)
     wanted = {(d.kind, d.key()): d for seed in seeds for kind in options.kind for d in [draw(seed, kind, meshes)]}
-    file = options.cache / "results" / f"{commit}.jsonl"
+    file = options.cache / "results" / f"{place_of(commit, without)}.jsonl"
     kept = {(r["kind"], r["key"]): r for r in read_rows(file) if r["preset"] == options.preset}
     left = [made for name, made in wanted.items() if name not in kept and not options.kept]
     if left:
@@ -170,7 +199,7 @@ def results(options: argparse.Namespace, tree: Path | None, commit: str) -> list
         file.parent.mkdir(parents=True, exist_ok=True)
         jobs = ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn"), os.nice, (19,))
         with jobs as pool, file.open("a") as out:
-            waiting = [pool.submit(measured, d, options.cache, place, commit, options.preset) for d in left]
+            waiting = [pool.submit(measured, d, options.cache, place, commit, options.preset, without) for d in left]
             for done, one in enumerate(waiting, 1):
                 row = one.result()
                 out.write(json.dumps(row) + "\n")
@@ -254,7 +283,7 @@ def singles(rows: Sequence[Row]) -> list[str]:
 
 
 def compared(a: Sequence[Row], b: Sequence[Row]) -> list[Row]:
-    """Return the paired differences of the same captures: b less a for shares, b over a for CPU seconds."""
+    """Return the paired differences of the same captures: b less a for shares, log b / a for depth, normals, CPU s."""
     other = {(row["kind"], row["key"]): row for row in b}
     pairs = [(row, other[row["kind"], row["key"]]) for row in a if (row["kind"], row["key"]) in other]
     lines = []
@@ -263,7 +292,10 @@ def compared(a: Sequence[Row], b: Sequence[Row]) -> list[Row]:
             is_one = [[[row["outcome"] == one for row in pair] for pair in some] for one in OUTCOMES]
             shares = [interval([float(y) - float(x) for x, y in found], np.mean) for found in is_one]
             line = {"second less first": name, "captures": len(some)} | dict(zip(OUTCOMES, shares, strict=True))
-            lines.append(line | {"CPU s, second over first": interval([y["cpu_s"] / x["cpu_s"] for x, y in some])})
+            for told, key in (("depth", "depth_pct"), ("normals", "normals_deg"), ("CPU s", "cpu_s")):
+                ratios = [np.log(y[key] / x[key]) for x, y in some if x.get(key) and y.get(key)]
+                line |= {f"{told}, log second over first": interval(ratios, np.mean) if ratios else "none"}
+            lines.append(line)
     return lines
 
 
@@ -280,6 +312,9 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--tree", type=Path, default=ROOT, help="the checkout whose program runs")
     parser.add_argument("--compare", nargs=2, metavar=("A", "B"), help="two commits")
+    parser.add_argument(
+        "--without", default="", metavar="NAME", help="a switch; measured beside the runs that are kept"
+    )
     options = parser.parse_args()
     last, options.cache = options.seed + options.count - 1, options.cache.resolve()
     if options.seed < FIRST_UNSEEN <= last:
@@ -295,6 +330,11 @@ def main() -> None:
     rows = results(options, options.tree.resolve(), commit)
     if not rows:
         raise SystemExit(f"none of these captures is kept for {commit}: run them without --kept.")
+    if options.without:
+        other = results(options, options.tree.resolve(), commit, options.without)
+        both = (summary(rows, commit), summary(other, f"without {options.without}"))
+        Sheet(None, seeds).write(both, table(compared(rows, other)))
+        return
     kinds = [summary([row for row in rows if row["kind"] == kind], kind) for kind in sorted({r["kind"] for r in rows})]
     is_unseen = last >= FIRST_UNSEEN
     parts = [*kinds, summary(rows, "all"), *by_factor(rows, FEWEST if is_unseen else 1)]

@@ -5,6 +5,8 @@ import re
 import runpy
 import sys
 from dataclasses import replace
+from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -182,3 +184,10 @@ def test_captures_from_1000_on_are_never_told_one_by_one(bench, seed, monkeypatc
     monkeypatch.setattr("sys.argv", ["bed.py", "--seed", "990", "--count", "20", "--cache", str(tmp_path)])
     with pytest.raises(SystemExit, match="two beds"):
         bed.main()
+
+
+def test_every_switch_names_what_the_program_has(bench):
+    for switch in bench("switches").SWITCHES.values():
+        for module, places in switch.items():
+            for place in places:
+                assert attrgetter(place)(import_module(module)) is not None
