@@ -209,10 +209,9 @@ def _background(
 
 def _scale(scene: Scene, field: GroundField, region: Bool[np.ndarray, "height width"]) -> float:
     """Return the field's log of albedo 1: the median of its light near the object over that of the lights' model."""
-    light = torch.from_numpy(field.light)
-    ratio = light - _modelled(scene, ground_points(scene).reshape(-1, 3)).reshape(light.shape)
-    near = ratio[:, torch.from_numpy(_near(region))]
-    return float(near[near.isfinite()].median()) if near.isfinite().any() else 0.0
+    near = torch.from_numpy(_near(region))
+    ratio = torch.from_numpy(field.light)[:, near] - _modelled(scene, ground_points(scene)[near])
+    return float(ratio[ratio.isfinite()].median()) if ratio.isfinite().any() else 0.0
 
 
 def _modelled(scene: Scene, points: Float[Tensor, "n 3"]) -> Float[Tensor, "photos n"]:

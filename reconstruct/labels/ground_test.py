@@ -83,9 +83,9 @@ def test_ground(
     """Classify pixels as object or ground, and label the shadows on the ground.
 
     A ground pixel has two values: I_k = albedo * (irradiance_k + ambient) when lit, a small one in shadow. The albedo
-    is the densest cluster of I_k / irradiance_k. Level tops of the object pass this test;
-    find_level_tops tells them from the ground. A given scene.mask is kept, and an `outline` that others found;
-    `background` is known to show neither.
+    is the densest cluster of I_k / irradiance_k. Level tops of the object pass this test; find_level_tops tells them
+    from the ground. A given scene.mask is kept, and an `outline` that others found; `background` is known to show
+    neither.
 
     Raises:
         ValueError: the scene has no photos (scene.rgb is None).
