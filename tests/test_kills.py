@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 from brief_drafts import ENVIRONMENT, brief_command
-from waiting import PATIENCE_S
 
 TESTS = Path(__file__).parent
 KILLS = ("capture", "calibrate", "hull", "solve", "mesh")  # the stage in whose first lines of log it is killed
 RESULTS = ("calibration.json", "fields.safetensors", "mesh.ply", "mesh.glb", "depth.npy", "normal.npy", "mask.png")
 FEW_PHOTOS = 8  # of each view
+PATIENCE_S = 1800.0  # of a whole run on a very busy machine
 ROOMS = (4_000, 150_000, 1_000_000)  # bytes of the longest file that the disk takes: no photos, no mesh, no fields
 
 pytestmark = pytest.mark.slow
