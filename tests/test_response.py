@@ -93,7 +93,7 @@ def test_derivatives_with_a_response_are_those_of_the_residuals(truth, evidence)
     flashlight, shared = jacobian(state, evidence)
     linear = np.einsum("kjp,kp->kj", flashlight, step[:cut].reshape(len(truth.lights), -1)) + shared @ step[cut:-3]
     linear -= (evidence.weight * linear).sum(0) / evidence.weight.sum(0)  # the albedo follows
-    bright = _model(state, evidence)[3].min(0) > 0.1
+    bright = _model(state, evidence).cosine.min(0) > 0.1
     assert np.abs((back - ahead) / 2 - linear)[:, bright].max() < 0.05 * np.abs(linear).max()
 
 

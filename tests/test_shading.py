@@ -91,7 +91,7 @@ def test_thejacobian_is_that_of_the_model(truth):
         np.einsum("kjp,kp->kj", flashlight, step[: PER_FLASHLIGHT * n].reshape(-1, PER_FLASHLIGHT))
         + shared @ step[PER_FLASHLIGHT * n : -3]
     )
-    inside = _model(flashlights, evidence)[3] > LOWEST_COSINE  # below, the beam is clamped
+    inside = _model(flashlights, evidence).cosine > LOWEST_COSINE  # below, the beam is clamped
     np.testing.assert_allclose(((there - back) / 2)[inside], linear[inside], atol=1e-8)  # third order of 1e-4 steps
 
 

@@ -141,7 +141,8 @@ def _elsewhere(best: _Found, evidence: Evidence) -> list[_Found]:
     grid = np.concatenate([centre + reach * DIRECTIONS for reach in REACHES])
     power = np.full(len(grid), np.median(state.log_power))
     there = replace(state, positions=grid, targets=np.repeat(state.aim[None], len(grid), 0), log_power=power)
-    light, among = log_irradiance(there, evidence), log_irradiance(state, evidence)
+    light = log_irradiance(replace(there, response=np.zeros(0)), evidence)
+    among = log_irradiance(state, evidence)
     exposure = np.zeros(len(among)) if evidence.exposure is None else evidence.exposure
     chosen = np.zeros((PLACES, len(state.positions)), int)
     for photo, exposed in enumerate(exposure - np.median(among + exposure[:, None])):
@@ -237,8 +238,7 @@ def _best_of_each(best: _Found, found: Sequence[_Found], evidence: Evidence) -> 
     costs = []
     for other in found:
         moved = np.where(own[..., None], other.fit.flashlights.positions, state.positions)
-        shadows = [replace(terms, trusted=terms.trusted | one).cost(at) for one, at in zip(own, moved, strict=True)]
-        costs.append(other.by_shading + shadows)
+        costs.append(other.by_shading + [terms.own_cost(photo, at) for photo, at in enumerate(moved)])
     chosen = np.argmin(costs, axis=0)
 
     def taken(values: Sequence[np.ndarray]) -> np.ndarray:

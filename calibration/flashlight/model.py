@@ -18,10 +18,10 @@ reflectance that depends on the fixed view alone. Only brightness ratios between
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
 from calibration.flashlight.beam_profile import SMOOTH_TERMS, derivatives
@@ -44,6 +44,21 @@ Samples = Float[np.ndarray, "photos cells"]
 Tangent = Callable[["Flashlights"], Float[np.ndarray, "full reduced"]]
 
 
+class _Modelled(NamedTuple):
+    """What a state says of every sample: a state's residuals, cost and derivatives ask for the same."""
+
+    light: Samples  # log irradiance
+    exposed: Samples | None  # log of light times exposure about its median over the series; None: linear pictures
+    pictured: Samples  # log irradiance as the pictures' response shows it
+    distance: Samples
+    toward: Float[np.ndarray, "photos cells 3"]
+    cosine: Samples
+    share: Samples  # of the light that comes straight from the flashlight
+    total: Samples
+    more: Samples  # by way of the wall
+    seen: float  # cosine off the axis of the sample that is farthest off
+
+
 @dataclass(frozen=True)
 class Flashlights:
     """The state of the fit: world frame, powers relative to one another."""
@@ -58,7 +73,7 @@ class Flashlights:
     # of the pictures; none: linear
     response: Float[np.ndarray, " responses"] = field(default_factory=lambda: np.zeros(0))
     oval: Float[np.ndarray, "photos 2"] | None = None  # log gain at OVAL_ANGLE by cos 2 phi, sin 2 phi; None: round
-    _modelled: list[tuple[GroundCells, float, tuple]] = field(default_factory=list, init=False, repr=False)
+    _modelled: list[tuple["Evidence", _Modelled]] = field(default_factory=list, init=False, repr=False)
 
     def per_flashlight(self) -> int:
         """Return the number of full coordinates per flashlight."""
@@ -140,41 +155,30 @@ class Evidence:
 
 def log_irradiance(flashlights: Flashlights, evidence: Evidence) -> Samples:
     """Return the log irradiance at every cell, relative to a flashlight of power 1 at a hand's usual distance."""
-    return _model(flashlights, evidence)[0]
+    return _model(flashlights, evidence).light
 
 
 def log_pictured(flashlights: Flashlights, evidence: Evidence) -> Samples:
     """Return the log irradiance as the pictures' response shows it."""
-    light = log_irradiance(flashlights, evidence)
-    if not len(flashlights.response):
-        return light
-    return light + bend(_log_exposed(flashlights, evidence), flashlights.response)
-
-
-def _log_exposed(flashlights: Flashlights, evidence: Evidence) -> Samples:
-    """Return the log of light times exposure about its median over the series, as the response is stated."""
-    light = log_irradiance(flashlights, evidence) + (0.0 if evidence.exposure is None else evidence.exposure[:, None])
-    return light - np.median(light)
+    return _model(flashlights, evidence).pictured
 
 
 def cosines(flashlights: Flashlights, evidence: Evidence) -> Samples:
     """Return the cosine of the angle off the beam's axis at which every cell is seen from every flashlight."""
-    return _model(flashlights, evidence)[3]
+    return _model(flashlights, evidence).cosine
 
 
-def _model(flashlights: Flashlights, evidence: Evidence):
-    """Return the log irradiance and the terms that its derivatives share: a state's residuals, cost and derivatives
-    ask for the same, so that the last answer stays with the state."""
-    for cells, height, known in flashlights._modelled:
-        if cells is evidence.cells and height == evidence.height:
+def _model(flashlights: Flashlights, evidence: Evidence) -> _Modelled:
+    """Compute what a state says, or return it: the last answer stays with the state."""
+    for before, known in flashlights._modelled:
+        if before.cells is evidence.cells and before.height == evidence.height and before.exposure is evidence.exposure:
             return known
-    found = _compute(flashlights, evidence)
-    flashlights._modelled[:] = [(evidence.cells, evidence.height, found)]
-    return found
+    flashlights._modelled[:] = [(evidence, _compute(flashlights, evidence))]
+    return flashlights._modelled[0][1]
 
 
-def _compute(flashlights: Flashlights, evidence: Evidence):
-    """Compute what _model returns.
+def _compute(flashlights: Flashlights, evidence: Evidence) -> _Modelled:
+    """Compute what a state says of every sample.
 
     The formula is that of calibration.light.irradiance on level ground, for all photos at once and in logarithms, with
     oval beams and ambient light added. Cosines are clamped at LOWEST_COSINE, where derivatives stay finite.
@@ -193,15 +197,20 @@ def _compute(flashlights: Flashlights, evidence: Evidence):
     seen = float(cosine.min())
     more = _by_wall(flashlights, evidence, flashlights.wall, seen)
     total = flash + flashlights.ambient + more
-    return np.log(total), distance, toward, cosine, flash / total, total, more, seen
+    light = pictured = np.log(total)
+    exposed = None
+    if len(flashlights.response):
+        exposed = light if evidence.exposure is None else light + evidence.exposure[:, None]
+        exposed = exposed - np.median(exposed)
+        pictured = light + bend(exposed, flashlights.response)
+    return _Modelled(light, exposed, pictured, distance, toward, cosine, flash / total, total, more, seen)
 
 
 def _by_wall(flashlights: Flashlights, evidence: Evidence, wall: Wall, narrowest: float) -> Samples:
     """Return the irradiance by way of a wall, relative to a flashlight of power 1 at a hand's usual distance."""
     points, middle = evidence.cells.points, evidence.cells.centre
     place = flashlights.positions, flashlights.axes(), flashlights.beam
-    power = np.exp(flashlights.log_power[:, None]) * hand.USUAL**2
-    return power * wall_light(wall, *place, narrowest, points, middle)
+    return np.exp(flashlights.log_power[:, None]) * hand.USUAL**2 * wall_light(wall, *place, narrowest, points, middle)
 
 
 def _oval_terms(
@@ -220,7 +229,7 @@ def jacobian(flashlights: Flashlights, evidence: Evidence):
     Two turns are neglected: that of the oval's terms with flashlight and axis, and that of the wall's light with the
     flashlight's place, aim and beam. Both are a few per cent of the light.
     """
-    _, distance, toward, cosine, share, total, more, seen = _model(flashlights, evidence)
+    _, exposed, _, distance, toward, cosine, share, total, more, seen = _model(flashlights, evidence)
     axes = flashlights.axes()
     by_cosine, by_term = derivatives(cosine, flashlights.beam)
     reach = np.linalg.norm(flashlights.targets - flashlights.positions, axis=1)[:, None, None]
@@ -240,11 +249,10 @@ def jacobian(flashlights: Flashlights, evidence: Evidence):
     by_wall = [(_by_wall(flashlights, evidence, wall + step, seen) - more) / BY for step in BY * np.eye(WALL_TERMS)[:2]]
     by_wall.append(_by_wall(flashlights, evidence, np.r_[wall[:2], 1.0], seen) if wall[2] <= 0 else more / wall[2])
     shared = [by_term * share[..., None], np.stack([np.ones_like(total), *by_wall], -1) / total[..., None]]
-    if not len(flashlights.response):
+    if exposed is None:
         return flashlight, np.concatenate(shared, -1)
-    light = _log_exposed(flashlights, evidence)
-    slope = 1 + (slopes(light) @ flashlights.response)[..., None]
-    return flashlight * slope, np.concatenate([*(slope * one for one in shared), integrals(light)], -1)
+    slope = 1 + (slopes(exposed) @ flashlights.response)[..., None]
+    return flashlight * slope, np.concatenate([*(slope * one for one in shared), integrals(exposed)], -1)
 
 
 def log_albedo(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> Float[np.ndarray, " cells"]:
@@ -273,44 +281,41 @@ def _median(values: Float[np.ndarray, "rows n"], known: Bool[np.ndarray, "rows n
     return np.where(some, 0.5 * (np.where(some, low, 0.0) + np.where(some, high, 0.0)), 0.0)
 
 
-def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
-    """Return the residuals of the priors, divided by their sigmas, and their derivatives (rows x full)."""
-    n, terms, shared = len(flashlights.positions), len(flashlights.beam), flashlights.shared()
-    own = flashlights.per_flashlight()
-    full = own * n + shared
-    jac = np.zeros((3 * n + shared + (own - PER_FLASHLIGHT) * n, full))
+def _prior_widths(flashlights: Flashlights, priors: Priors) -> Float[np.ndarray, " shared"]:
+    """Return the sigmas of what all flashlights share."""
+    smooth = min(len(flashlights.beam), SMOOTH_TERMS)
+    beam = np.repeat([priors.beam, priors.ring], [smooth, len(flashlights.beam) - smooth])
+    response = WIDTHS[: len(flashlights.response)]
+    return np.r_[beam, priors.ambient, priors.wall, response, np.full(3, priors.aim_mean)]
+
+
+def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors) -> Float[np.ndarray, " rows"]:
+    """Return the residuals of the priors, divided by their sigmas."""
+    miss = (flashlights.targets - flashlights.aim) / priors.aim
     first, second = across(flashlights.axes())
-    miss = flashlights.targets - flashlights.aim
-    width = priors.aim
-    rows = np.arange(n)
-    for offset, basis in ((0, first), (n, second)):
-        jac[offset + rows[:, None], own * rows[:, None] + [3, 4, 5]] = basis / width
-        jac[offset + rows, -3:] = -basis / width
     own_power = flashlights.log_power - priors.usual
     bent = 1 + (own_power / priors.power_outlier) ** 2
-    jac[2 * n + rows, own * rows + 6] = bent**-1.5 / priors.log_power
-    rest = np.arange(own * n, full)
-    widths = np.r_[
-        np.full(min(terms, SMOOTH_TERMS), priors.beam),
-        np.full(max(terms - SMOOTH_TERMS, 0), priors.ring),
-        priors.ambient,
-        priors.wall,
-        WIDTHS[: len(flashlights.response)],
-        np.full(3, priors.aim_mean),
-    ]
-    jac[3 * n : 3 * n + len(rest), rest] = np.diag(1 / widths)
-    oval = np.zeros(0) if flashlights.oval is None else flashlights.oval.T.ravel() / priors.oval
-    for term in range(own - PER_FLASHLIGHT):
-        jac[3 * n + len(rest) + n * term + rows, own * rows + PER_FLASHLIGHT + term] = 1 / priors.oval
     missed = flashlights.aim - evidence.cells.centre
-    value = np.r_[
-        (miss * first).sum(1) / width,
-        (miss * second).sum(1) / width,
-        own_power / bent**0.5 / priors.log_power,
-        np.r_[flashlights.beam, flashlights.ambient, flashlights.wall - NO_WALL, flashlights.response, missed] / widths,
-        oval,
-    ]
-    return value, jac
+    shared = np.r_[flashlights.beam, flashlights.ambient, flashlights.wall - NO_WALL, flashlights.response, missed]
+    shared /= _prior_widths(flashlights, priors)
+    oval = np.zeros(0) if flashlights.oval is None else flashlights.oval.T.ravel() / priors.oval
+    return np.r_[(miss * first).sum(1), (miss * second).sum(1), own_power / bent**0.5 / priors.log_power, shared, oval]
+
+
+def _prior_slopes(flashlights: Flashlights, priors: Priors) -> Float[np.ndarray, "rows full"]:
+    """Return the derivatives of _prior_terms."""
+    n, shared, own = len(flashlights.positions), flashlights.shared(), flashlights.per_flashlight()
+    jac = np.zeros((3 * n + shared + (own - PER_FLASHLIGHT) * n, own * n + shared))
+    rows = np.arange(n)
+    for offset, basis in zip((0, n), across(flashlights.axes()), strict=True):
+        jac[offset + rows[:, None], own * rows[:, None] + [3, 4, 5]] = basis / priors.aim
+        jac[offset + rows, -3:] = -basis / priors.aim
+    bent = 1 + ((flashlights.log_power - priors.usual) / priors.power_outlier) ** 2
+    jac[2 * n + rows, own * rows + 6] = bent**-1.5 / priors.log_power
+    jac[3 * n : 3 * n + shared, own * n :] = np.diag(1 / _prior_widths(flashlights, priors))
+    for term in range(own - PER_FLASHLIGHT):
+        jac[3 * n + shared + n * term + rows, own * rows + PER_FLASHLIGHT + term] = 1 / priors.oval
+    return jac
 
 
 def across(axes: Float[np.ndarray, "photos 3"]):
@@ -326,9 +331,15 @@ def free_tangent(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
 
     The shared parameters are beam, ambient, wall, response and mean aim.
     """
-    beams, rest = np.stack(across(flashlights.axes()), -1), np.eye(flashlights.per_flashlight() - 6)
-    own = (block for beam in beams for block in (np.eye(3), beam, rest))
-    return np.asarray(block_diag(*own, np.eye(flashlights.shared())))
+    n, own, shared = len(flashlights.positions), flashlights.per_flashlight(), flashlights.shared()
+    basis = np.zeros((own * n + shared, (own - 1) * n + shared))
+    blocks = basis[: own * n, : (own - 1) * n].reshape(n, own, n, own - 1)
+    photo = range(n)
+    blocks[photo, :3, photo, :3] = np.eye(3)
+    blocks[photo, 3:6, photo, 3:5] = np.stack(across(flashlights.axes()), -1)
+    blocks[photo, 6:, photo, 5:] = np.eye(own - 6)
+    basis[own * n :, (own - 1) * n :] = np.eye(shared)
+    return basis
 
 
 def pulled(jacobian: tuple[np.ndarray, np.ndarray], weighted: Samples) -> Float[np.ndarray, " full"]:
@@ -372,7 +383,7 @@ def normal_equations(
         matrix[cut:-3, block] += mixed[k].T
     matrix[cut:-3, cut:-3] += np.einsum("kj,kjg,kjh->gh", weight, shared, shared, optimize=True)
     downhill = pulled((flashlight, shared), weight * residual)
-    value, jac = _prior_terms(flashlights, evidence, priors)
+    value, jac = _prior_terms(flashlights, evidence, priors), _prior_slopes(flashlights, priors)
     if evidence.outlines is not None:
         more, by_place = evidence.outlines.rows(flashlights.positions)
         wide = np.zeros((len(more), full))
@@ -384,6 +395,6 @@ def normal_equations(
 
 def cost(flashlights: Flashlights, evidence: Evidence, weight: Samples, priors: Priors) -> float:
     """Return half the weighted sum of squared log residuals with priors: the objective of `descend`."""
-    value = _prior_terms(flashlights, evidence, priors)[0]
+    value = _prior_terms(flashlights, evidence, priors)
     outlines = 0.0 if evidence.outlines is None else evidence.outlines.cost(flashlights.positions)
     return outlines + 0.5 * float((weight * cell_residuals(flashlights, evidence, weight) ** 2).sum() + value @ value)

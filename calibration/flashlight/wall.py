@@ -59,6 +59,8 @@ def wall_light(
     inside = np.maximum(cosine, narrowest)
     gain = log_gain(inside, beam) + abs(beam[0]) * np.log(np.maximum(cosine, DARKEST) / inside)
     lit = np.where(cosine > 0, np.exp(gain) * np.maximum(to_patch @ away, 0) / distance**3, 0.0)
-    to_cell = points - patches[:, None]
-    form = np.maximum(-(to_cell @ away), 0) * -to_cell[..., 2] / np.einsum("wjx,wjx->wj", to_cell, to_cell) ** 2
-    return wall[2] / np.pi * lit @ (np.maximum(form, 0) * area[:, None])
+    level, deep = patches @ away, points @ away  # along the wall's normal: points lie before it
+    below = patches[:, 2:] - points[:, 2]
+    apart = (patches**2).sum(1)[:, None] + (points**2).sum(1) - 2 * patches @ points.T
+    form = np.maximum(level[:, None] - deep, 0) * np.maximum(below, 0) / apart**2
+    return wall[2] / np.pi * lit @ (form * area[:, None])

@@ -42,27 +42,29 @@ def residuals(
     lights: Float[np.ndarray, "photos 3"],
     eye: Float[np.ndarray, "3"],
     used: Bool[np.ndarray, " photos"],
-    blur: float = 1.0,
+    coarse: float = 1.0,
+    of: Bool[np.ndarray, " views"] | None = None,
 ) -> Residuals:
-    """Return the emptiness of all rays.
+    """Return the emptiness of all rays, or of those of some views.
 
     Args:
         lights: positions, world, z above the ground; eye: the camera's centre likewise.
         used: photos that take part.
-        blur: factor of an outline's sigma: what is far below it is not looked for.
+        coarse: factor of FINE, below which nothing is looked for.
+        of: whose rays, the camera's last; None: of all, with those of photos from the side.
     """
     from calibration.outlines.coherence_kernels import least_empty  # numba: help and refusals do not wait for it
 
     views = np.concatenate([lights, eye[None]])
     takes_part = np.append(used, True)
-    chosen = takes_part[maps.owner]
+    chosen = takes_part[maps.owner] if of is None else (takes_part & of)[maps.owner]
     starts, owner = maps.starts[chosen], maps.owner[chosen]
     emptiness, height = np.empty(len(starts)), np.empty(len(starts))
     by = np.empty(len(starts), np.int64)
     soft = np.append(softness(maps, lights), 0.0)
     where = _where(maps, views, takes_part.astype(np.uint8), soft)
     first = maps.first_height[chosen]
-    least_empty(starts, owner, where, TALLEST * maps.size, FINE * blur * maps.pixel, first, emptiness, height, by)
+    least_empty(starts, owner, where, TALLEST * maps.size, FINE * coarse * maps.pixel, first, emptiness, height, by)
     maps.first_height[chosen] = first
     light, h = views[owner], height[:, None]
     at = np.concatenate([starts + (light[:, :2] - starts) * h / light[:, 2:], h], 1)
@@ -71,7 +73,7 @@ def residuals(
     d_owner = np.concatenate([slope * h / light[:, 2:], -along * h / light[:, 2:] ** 2], 1)
     wide = _wide(soft, by, height, soft[owner])
     found = Residuals(emptiness, owner, by, d_owner / wide, d_by / wide)
-    return found if maps.space is None else _with_fixed_rays(found, maps, views, where)
+    return found if maps.space is None or of is not None else _with_fixed_rays(found, maps, views, where)
 
 
 def _wide(soft: np.ndarray, by: np.ndarray, height: np.ndarray, own_soft: np.ndarray | float):

@@ -28,11 +28,11 @@ class OutlineTerms:
     highlights: MirrorHighlights | None = None  # numbered as the maps' photos
     blur: float = 1.0  # factor of an outline's sigma, for a search that begins far from the answer
     every: int = 1  # one ray in so many is looked at, and counts for those left out
-    _looks: list[tuple[np.ndarray, np.ndarray, Residuals]] = field(default_factory=list, init=False)
+    _looks: list[tuple[np.ndarray, Residuals]] = field(default_factory=list, init=False)
 
     def rows(self, positions: Float[np.ndarray, "photos 3"]):
         """Return residuals in sigmas, Cauchy's weight applied, and derivatives (rows, photos, 3) by the positions."""
-        found = self._look(positions, self.trusted)
+        found = self._look(positions)
         sigma = PIXEL_ERROR * self.maps.pixel * self.blur
         active = found.emptiness > 0
         size = found.emptiness[active] / sigma
@@ -64,17 +64,23 @@ class OutlineTerms:
         A photo that is not trusted is compared with the trusted ones.
         """
         misfit = np.zeros(len(positions))
-        together = self._look(positions, self.trusted)
-        for photo, one in enumerate(np.eye(len(positions)) > 0):
-            found = together if self.trusted[photo] else self._look(positions, self.trusted | one)
+        together = self._look(positions)
+        for photo, trusted in enumerate(self.trusted):
+            found = together if trusted else self._of_photo(photo, positions)
             misfit[photo] = found.misfit(photo) / self.maps.pixel
         return np.nan_to_num(misfit, nan=0.0)
 
     def cost(self, positions: Float[np.ndarray, "photos 3"]) -> float:
         """Return half the sum of squares whose weighted rows `rows` gives: Cauchy's function."""
-        found = self._look(positions, self.trusted)
+        return self._at_odds(self._look(positions)) + self.other_cost(positions)
+
+    def own_cost(self, photo: int, positions: Float[np.ndarray, "photos 3"]) -> float:
+        """Return `cost` by one photo's rays and the camera's alone, the photo trusted."""
+        return self._at_odds(self._of_photo(photo, positions, True)) + self.other_cost(positions)
+
+    def _at_odds(self, found: Residuals) -> float:
         size = np.maximum(found.emptiness, 0) / (PIXEL_ERROR * self.maps.pixel * self.blur)
-        return float(np.log1p(size**2).sum() * self.every / (2 * SAME)) + self.other_cost(positions)
+        return float(np.log1p(size**2).sum() * self.every / (2 * SAME))
 
     def other_cost(self, positions: Float[np.ndarray, "photos 3"]) -> float:
         """Half the sum of squares of unusual distances, and Geman and McClure's function of highlights.
@@ -109,12 +115,23 @@ class OutlineTerms:
         slope = turn @ (np.eye(3) - light[:, :, None] * light[:, None]) / (total * distance)[:, None, None]
         return half[:, :2] / sigma[:, None], slope[:, :2] / sigma[:, None, None], owner
 
-    def _look(self, positions: Float[np.ndarray, "photos 3"], takes_part: Bool[np.ndarray, " photos"]) -> Residuals:
-        lift = np.array([0.0, 0.0, self.ground])
-        lights, used = positions - lift, takes_part & self.maps.is_outlined()
-        for before, at, found in self._looks:  # cost and rows of one state, one after the other
-            if np.array_equal(before, used) and np.array_equal(at, lights):
+    def _look(self, positions: Float[np.ndarray, "photos 3"]) -> Residuals:
+        for before, found in self._looks:  # cost and rows of one state, one after the other
+            if np.array_equal(before, positions):
                 return found
-        found = residuals(self.maps, lights, self.eye - lift, used, self.blur)
-        self._looks[:] = [(used, lights, found), *self._looks[: LOOKS - 1]]
+        found = self._residuals(positions, self.trusted)
+        self._looks[:] = [(positions, found), *self._looks[: LOOKS - 1]]
         return found
+
+    def _of_photo(self, photo: int, positions: Float[np.ndarray, "photos 3"], and_camera: bool = False) -> Residuals:
+        own = np.arange(len(positions)) == photo
+        return self._residuals(positions, self.trusted | own, np.append(own, and_camera))
+
+    def _residuals(
+        self,
+        positions: Float[np.ndarray, "photos 3"],
+        takes_part: Bool[np.ndarray, " photos"],
+        of: Bool[np.ndarray, " views"] | None = None,
+    ) -> Residuals:
+        lift, used = np.array([0.0, 0.0, self.ground]), takes_part & self.maps.is_outlined()
+        return residuals(self.maps, positions - lift, self.eye - lift, used, self.blur * self.every, of)
