@@ -70,6 +70,27 @@ def test_derivatives_are_those_of_differences(ball):
     assert np.corrcoef(slope[same], numeric[same])[0, 1] > 0.97
 
 
+def test_rays_of_some_views_are_those_among_all(ball):
+    _, lights, maps = ball
+    wrong = lights * (1 + 0.05 * np.random.default_rng(0).standard_normal(lights.shape))
+    every, of = np.ones(len(lights), bool), np.arange(len(lights) + 1) == 2
+    found, some = residuals(maps, wrong, EYE, every), residuals(maps, wrong, EYE, every, of=of)
+    assert (some.owner == 2).all() and len(some.owner) == (found.owner == 2).sum() > 0
+    np.testing.assert_allclose(some.emptiness, found.emptiness[found.owner == 2], rtol=0.05, atol=0.1 * maps.pixel)
+
+
+def test_a_photo_at_odds_with_the_others_tells_by_its_own_rays(ball):
+    _, lights, maps = ball
+    terms, moved = terms_of(maps), lights.copy()
+    right = terms.own_cost(3, moved), terms.own_cost(5, moved)
+    moved[3] += [60.0, -40.0, 0.0]  # in place: what was asked before is not taken for it
+    assert terms.own_cost(3, moved) > right[0] + 1.0
+    assert terms.own_cost(3, moved) - right[0] > terms.own_cost(5, moved) - right[1]
+    at_odds = terms.cost(moved)
+    moved[3] = lights[3]
+    assert terms.cost(moved) < at_odds
+
+
 def _at_many_heights(maps, lights: np.ndarray, start: np.ndarray, own: int) -> float:
     """Emptiness of a ray by brute force: 4000 heights, every view at each."""
     views, soft = np.concatenate([lights, EYE[None]]), np.append(softness(maps, lights), 0.0)

@@ -230,7 +230,7 @@ def farther(
 def _best_of_each(best: _Found, found: Sequence[_Found], evidence: Evidence) -> Flashlights:
     """Return the best fit's state, each light where the fit has it that explains its photo best, the others held.
 
-    A photo's shading counts as cells whose errors are independent, its outlines as they do in the fit.
+    A photo's shading counts as cells whose errors are independent, its own rays and the camera's as they do in the fit.
     """
     terms, state = evidence.outlines, best.fit.flashlights
     assert terms is not None

@@ -56,7 +56,6 @@ class _Modelled(NamedTuple):
     share: Samples  # of the light that comes straight from the flashlight
     total: Samples
     more: Samples  # by way of the wall
-    seen: float  # cosine off the axis of the sample that is farthest off
 
 
 @dataclass(frozen=True)
@@ -194,8 +193,7 @@ def _compute(flashlights: Flashlights, evidence: Evidence) -> _Modelled:
     z = flashlights.positions[:, 2] - evidence.height
     log_flash = flashlights.log_power[:, None] + log_gain + np.log(z * hand.USUAL**2)[:, None] - 3 * np.log(distance)
     flash = np.exp(log_flash)
-    seen = float(cosine.min())
-    more = _by_wall(flashlights, evidence, flashlights.wall, seen)
+    more = _by_wall(flashlights, evidence, flashlights.wall, float(cosine.min()))
     total = flash + flashlights.ambient + more
     light = pictured = np.log(total)
     exposed = None
@@ -203,7 +201,7 @@ def _compute(flashlights: Flashlights, evidence: Evidence) -> _Modelled:
         exposed = light if evidence.exposure is None else light + evidence.exposure[:, None]
         exposed = exposed - np.median(exposed)
         pictured = light + bend(exposed, flashlights.response)
-    return _Modelled(light, exposed, pictured, distance, toward, cosine, flash / total, total, more, seen)
+    return _Modelled(light, exposed, pictured, distance, toward, cosine, flash / total, total, more)
 
 
 def _by_wall(flashlights: Flashlights, evidence: Evidence, wall: Wall, narrowest: float) -> Samples:
@@ -229,7 +227,7 @@ def jacobian(flashlights: Flashlights, evidence: Evidence):
     Two turns are neglected: that of the oval's terms with flashlight and axis, and that of the wall's light with the
     flashlight's place, aim and beam. Both are a few per cent of the light.
     """
-    _, exposed, _, distance, toward, cosine, share, total, more, seen = _model(flashlights, evidence)
+    _, exposed, _, distance, toward, cosine, share, total, more = _model(flashlights, evidence)
     axes = flashlights.axes()
     by_cosine, by_term = derivatives(cosine, flashlights.beam)
     reach = np.linalg.norm(flashlights.targets - flashlights.positions, axis=1)[:, None, None]
@@ -245,7 +243,7 @@ def jacobian(flashlights: Flashlights, evidence: Evidence):
         flashlight[..., PER_FLASHLIGHT:] = _oval_terms(toward, cosine, axes)
     flashlight *= share[..., None]
     flashlight[..., 6] += more / total
-    wall = flashlights.wall
+    wall, seen = flashlights.wall, float(cosine.min())
     by_wall = [(_by_wall(flashlights, evidence, wall + step, seen) - more) / BY for step in BY * np.eye(WALL_TERMS)[:2]]
     by_wall.append(_by_wall(flashlights, evidence, np.r_[wall[:2], 1.0], seen) if wall[2] <= 0 else more / wall[2])
     shared = [by_term * share[..., None], np.stack([np.ones_like(total), *by_wall], -1) / total[..., None]]

@@ -27,7 +27,7 @@ class OutlineTerms:
     trusted: Bool[np.ndarray, " photos"]  # the others neither prove space empty nor count
     highlights: MirrorHighlights | None = None  # numbered as the maps' photos
     blur: float = 1.0  # factor of an outline's sigma, for a search that begins far from the answer
-    every: int = 1  # one ray in so many is looked at, and counts for those left out
+    every: int = 1  # one ray in so many is looked at, that much less closely, and counts for those left out
     _looks: list[tuple[np.ndarray, Residuals]] = field(default_factory=list, init=False)
 
     def rows(self, positions: Float[np.ndarray, "photos 3"]):
@@ -120,7 +120,7 @@ class OutlineTerms:
             if np.array_equal(before, positions):
                 return found
         found = self._residuals(positions, self.trusted)
-        self._looks[:] = [(positions, found), *self._looks[: LOOKS - 1]]
+        self._looks[:] = [(positions.copy(), found), *self._looks[: LOOKS - 1]]
         return found
 
     def _of_photo(self, photo: int, positions: Float[np.ndarray, "photos 3"], and_camera: bool = False) -> Residuals:
