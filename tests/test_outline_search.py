@@ -88,18 +88,6 @@ def test_what_the_camera_sees_of_the_object_and_its_shadows_is_no_ground(ball):
         np.testing.assert_array_equal(row[row > 0], before[row > 0])
 
 
-@pytest.mark.parametrize("times", [0.7, 1.2, 1.5])
-def test_outlines_do_not_see_how_far_away_all_lights_are(ball, times):
-    """Moved so, the lights agree as the right ones do; merely raised, they do not."""
-    _, lights, maps = ball
-    evidence = _shaded(maps, lights)
-    moved = joint_search.farther(lights, evidence, times)
-    assert evidence.outlines is not None
-    assert np.median(_off(moved, lights)) > 0.15
-    by_height = evidence.outlines.misfit(lights * [1, 1, times])
-    assert np.percentile(evidence.outlines.misfit(moved), 80) < min(0.3, np.percentile(by_height, 80))
-
-
 def _with_one_lost(maps, lights: np.ndarray, k: int) -> tuple[FlashlightFit, Evidence]:
     """A state with one light on the other side, and the evidence."""
     evidence = _shaded(maps, lights)

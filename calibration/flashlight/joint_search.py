@@ -1,7 +1,7 @@
 """All lights from outlines of shadows and the shading of all photos together, from rough starts.
 
-The work is bounded: outlines alone from each start, then a few fits to both in rounds, of other distances and walls.
-Photos that are at odds add none.
+The work is bounded: a fit from each start, with outlines blurred at first, then a few fits in rounds. Photos that are
+at odds add none.
 """
 
 import logging
@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from calibration.flashlight.beam_profile import EXTRA_TERMS, SMOOTH_TERMS
+from calibration.flashlight.beam_profile import EXTRA_TERMS
 from calibration.flashlight.descent import refine
 from calibration.flashlight.fit import (
     ALIKE_POWER,
@@ -26,7 +26,6 @@ from calibration.flashlight.fit import (
     variance_about,
 )
 from calibration.flashlight.model import (
-    LAMP,
     NOISE,
     Evidence,
     Flashlights,
@@ -37,29 +36,27 @@ from calibration.flashlight.model import (
     log_irradiance,
 )
 from calibration.flashlight.pictured import bent, own_tangent, places_held, without_wall
-from calibration.flashlight.wall import WALL_TERMS, Wall
+from calibration.flashlight.wall import WALL_TERMS
 from calibration.lights import hand
 from calibration.lights.response import bend
 from capture.checks.robust import spread
 
 LOG = logging.getLogger(__name__)
-BLURS = tuple(np.geomspace(200.0, 1.0, 14))  # factors of an outline's sigma: at first 30 px, as far as rough starts lie
-PER_BLUR = 3  # steps with each
+BLURS = tuple(np.geomspace(200.0, 1.0, 28))  # factors of an outline's sigma: at first 30 px, as far as rough starts lie
+AGAIN = tuple(np.geomspace(10.0, 1.0, 8))  # from a fit on: 1.5 px free lights from false minima
+PER_BLUR = 2  # steps with each
 SETTLES = 2  # fits in turn: the first tells the misfit by which the second weighs its cells
-MUTE = 1e-9  # times a cell's weight: outlines alone
 NO_GROUND = 1e-6  # log units: a misfit of less is that of no cell
 LOST = 1e9  # the cost of lights that no ground follows
 SCATTER = 15.0  # of the negative log posterior: searches in ten simulated captures end 0 to 23 above the truth's
-FARTHER = (0.5, 0.6, 0.72, 0.85, 1.0, 1.18, 1.4, 1.65, 2.0)  # along what outlines leave free: a hand's range
-HOPS = (0.7, 0.85, 1.18, 1.4)  # likewise, from a fit on: half a stop and one, of what the ground receives
-ROUNDS = 10  # of other walls and distances, at most
+ROUNDS = 10  # of walls and of lights of other fits, at most
 BESIDE = np.radians(15.0)  # between neighbours of a grid of places: DIRECTIONS lie as far apart, ...
 REACHES = np.exp(np.arange(np.log(hand.NEAREST), np.log(hand.FARTHEST), BESIDE))  # ... and distances (mm), as a share
 PLACES = 4  # of each light, in different directions or distances: where its photo's shading may have a minimum
 EVERY = 4  # of the cells, and of the outlines' rays: neighbours err together (SAME of outlines.terms)
+WALLED = 3  # walls that are fitted further: places and wall settle together
 COMPARED = 4  # fits, of which a light is taken from where it explains its photo best
 GAINED = 3.0  # of the negative log posterior, strong evidence [Kass and Raftery 1995]: a last round lowers it less
-NEAR_INFINITY = 0.05  # a light that would be moved 20 times as far stays
 # tried first: as near as a wall behind a thing stands (mm), of middle grey; the fit moves them
 WALLS = tuple(np.array([azimuth, np.log(hand.NEAREST * 1.4), 0.5]) for azimuth in np.arange(8) * np.pi / 4)
 
@@ -79,11 +76,11 @@ def searched(
     """Fit to outlines and shading together from rough starts; return the most probable fit.
 
     Outlines alone leave free how far away all lights are, and more where the thing is round; shading alone leaves free
-    what distance, beam and response make of one another. What both allow is narrow. First each start follows the
-    outlines alone, with a sigma that falls to their own (graduated non-convexity) [Blake and Zisserman, Visual
-    Reconstruction (1987)]. In rounds all lights of each line are then tried at other distances, with a wall, and each
-    light where another fit has it or where its own photo alone leads it; the most probable are fitted to both. The
-    worse half of the lines ends with each round (successive halving) [Jamieson and Talwalkar, AISTATS (2016)].
+    what distance, beam and response make of one another. What both allow is narrow: each start follows both together,
+    with a sigma of the outlines that falls to their own (graduated non-convexity) [Blake and Zisserman, Visual
+    Reconstruction (1987)]. In rounds each line then tries a wall, blurred outlines again, and each light where another
+    fit has it or where its own photo alone leads it. The worse half of the lines ends with each round (successive
+    halving) [Jamieson and Talwalkar, AISTATS (2016)].
     `between` of the fit holds what all fits say that explain the photos about as well.
 
     Args:
@@ -97,10 +94,10 @@ def searched(
     assert evidence.outlines is not None
     few = evidence.at(np.arange(0, len(evidence.cells.points), EVERY))
     few = replace(few, outlines=evidence.outlines.thinned(EVERY))
-    lines = [_settled(by_shading, few, _judged(by_shading, few, few.weight).misfit)]
+    lines = [_annealed(_shaded(by_shading, few), few, BLURS)]
     for number, one in enumerate(starts):
         LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", number + 1, len(starts))
-        lines.append(_begun(replace(plain, positions=one), few))
+        lines.append(_annealed(_shaded(replace(plain, positions=one), few), few, BLURS))
     found = list(lines)
     for number in range(ROUNDS):
         LOG.info("fitting lights to outlines of shadows and shading, round %d of at most %d", number + 1, ROUNDS)
@@ -121,13 +118,12 @@ def searched(
 
 
 def _improved(best: _Found, found: Sequence[_Found], evidence: Evidence) -> list[_Found]:
-    """Return fits from the best one with a wall, at another distance, and with lights of the others that were found."""
+    """Return fits from the best one: with blurred outlines, with lights of the others that were found, with a wall."""
     state = best.fit.flashlights
-    walled = [_shaded(state, state.positions, wall, evidence) for wall in WALLS if state.wall[2] <= 0]
-    hops = [one for times in HOPS for one in _both(state, farther(state.positions, evidence, times), evidence)]
-    tried = [*_likeliest(walled, 1), *_likeliest(hops, 1)]
-    mixed = _settled(_best_of_each(best, [*found, *_elsewhere(best, evidence)], evidence), evidence, best.misfit)
-    return [mixed, *(_settled(one.fit.flashlights, evidence, one.misfit) for one in tried)]
+    mixed = _best_of_each(best, [*found, *_elsewhere(best, evidence)], evidence)
+    walled = [_shaded(replace(state, wall=wall), evidence) for wall in WALLS if state.wall[2] <= 0]
+    new = [_annealed(best, evidence, AGAIN), _annealed(_judged(mixed, evidence, evidence.weight), evidence, AGAIN)]
+    return new + [_settled(one.fit.flashlights, evidence, one.misfit) for one in _likeliest(walled, WALLED)]
 
 
 def _elsewhere(best: _Found, evidence: Evidence) -> list[_Found]:
@@ -163,68 +159,24 @@ def _elsewhere(best: _Found, evidence: Evidence) -> list[_Found]:
 
 def settled(start: Flashlights, evidence: Evidence) -> FlashlightFit:
     """Return the fit to outlines and shading from a state near the answer."""
-    return _settled(start, evidence, _shaded(start, start.positions, start.wall, evidence).misfit).fit
+    return _settled(start, evidence, _shaded(start, evidence).misfit).fit
 
 
-def _by_outlines(start: Flashlights, evidence: Evidence) -> Flashlights:
-    """Return the lights where outlines alone lead them, blurred at first."""
-    assert evidence.outlines is not None
-    few = evidence.at(np.arange(2))
-    few = replace(few, weight=np.full_like(few.weight, MUTE))
-    columns = np.arange(start.per_flashlight() * len(start.positions)) % start.per_flashlight() < 3
-    full = len(columns) + start.shared()
-    held = np.eye(full)[:, : len(columns)][:, columns]
-    for blur in BLURS:
-        blurred = replace(few, outlines=replace(evidence.outlines, blur=float(blur)))
-        start = refine(start, blurred, ALIKE_POWER, lambda _: held, FAR[:PER_BLUR])[0]
-    return start
-
-
-def _begun(start: Flashlights, evidence: Evidence) -> _Found:
-    """Return the best of two fits from where outlines alone lead the lights, each at the likeliest distance."""
-    places = _by_outlines(start, evidence).positions
-    tried = [_both(start, farther(places, evidence, times), evidence) for times in FARTHER]
-    best = [_likeliest(same, 1)[0] for same in zip(*tried, strict=True)]
-    return _likeliest([_settled(one.fit.flashlights, evidence, one.misfit) for one in best], 1)[0]
-
-
-def _both(like: Flashlights, places: Float[np.ndarray, "photos 3"], evidence: Evidence) -> tuple[_Found, _Found]:
-    """Return the state with such places, shaded from its own beam and response, and by a smooth beam without response.
-
-    Rings and response stand in for what is wrong with places far off; few terms lead to places nearer the truth.
-    """
-    smooth = replace(like, positions=places, beam=like.beam[:SMOOTH_TERMS], response=np.zeros(0))
-    smooth, weight = _lighting(smooth, evidence)
-    return _shaded(like, places, like.wall, evidence), _judged(bent(smooth, evidence), evidence, weight)
-
-
-def _shaded(like: Flashlights, places: Float[np.ndarray, "photos 3"], wall: Wall, evidence: Evidence) -> _Found:
-    """Return the state with such places and wall whose beam, aims, powers and response shade the ground best."""
-    state, weight = _lighting(replace(like, positions=places, wall=wall), evidence)
-    return _judged(state, evidence, weight)
-
-
-def _lighting(state: Flashlights, evidence: Evidence) -> tuple[Flashlights, Samples]:
-    """Return the state whose beam, aims, powers and response shade the ground best, its places held, and weights."""
-    return refine(state, replace(evidence, outlines=None), ALIKE_POWER, places_held, FAR[:6])
-
-
-def farther(
-    positions: Float[np.ndarray, "photos 3"], evidence: Evidence, times: float
-) -> Float[np.ndarray, "photos 3"]:
-    """Return the lights moved as outlines do not see it, the middle one so many times as far from the eye; world.
-
-    A perspectivity that keeps the ground's points and the eye turns one object, its shadows and its outline into
-    another's [Kriegman and Belhumeur, What shadows reveal about object structure, J. Opt. Soc. Am. A 18 (2001)].
-    """
-    terms = evidence.outlines
+def _annealed(begun: _Found, evidence: Evidence, blurs: Sequence[float]) -> _Found:
+    """Return the fit from a rough state on, with outlines first blurred and then sharp."""
+    state, misfit, terms = begun.fit.flashlights, begun.misfit, evidence.outlines
     assert terms is not None
-    ground = np.array([0.0, 0.0, terms.ground])
-    above, eye = positions - ground, terms.eye - ground
-    share = (1 / times - 1) / np.median(above[:, 2])
-    across = 1 + share * above[:, 2:]
-    moved = (above + share * above[:, 2:] * eye) / np.maximum(across, NEAR_INFINITY)
-    return np.where((across > NEAR_INFINITY) & (moved[:, 2:] > LAMP), moved, above) + ground
+    for blur in blurs:
+        weighted = _weighted(replace(evidence, outlines=replace(terms, blur=float(blur))), misfit)
+        state, weight = refine(state, weighted, ALIKE_POWER, without_wall, FAR[:PER_BLUR])
+        misfit = spread(cell_residuals(state, evidence, weight)[evidence.weight > 0])
+    return _settled(state, evidence, misfit)
+
+
+def _shaded(like: Flashlights, evidence: Evidence) -> _Found:
+    """Return the state with such places and wall whose beam, aims, powers and response shade the ground best."""
+    state, weight = refine(like, replace(evidence, outlines=None), ALIKE_POWER, places_held, FAR[:6])
+    return _judged(state, evidence, weight)
 
 
 def _best_of_each(best: _Found, found: Sequence[_Found], evidence: Evidence) -> Flashlights:
