@@ -9,13 +9,22 @@ import numpy as np
 import pytest
 import scipy.io
 from dataset_folders import write_s3nerf, write_shadowneus, write_shadowneus_real
-from flashlight_photos import CAMERA, POSED_CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights, photograph
+from flashlight_photos import (
+    AMBIENT,
+    CAMERA,
+    LOBE,
+    POSED_CAMERA,
+    WORLD_FROM_CAMERA,
+    Recipe,
+    handheld_lights,
+    photograph,
+)
 from synthetic import Look, render
 
 from calibration.calibration import Calibration, save_calibration
 from calibration.lights.files import read_lights, read_opinions
 from calibration.lights.layouts import BLENDER
-from calibration.lights.power import SHADING_MISFIT, with_power_per_photo
+from calibration.lights.power import SHADING_MISFIT, on_albedo_scale, with_power_per_photo
 from calibration.lights_of_file import with_opinions
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
@@ -282,3 +291,14 @@ def test_a_wrong_matlab_file_is_refused_by_what_is_wrong(tmp_path, write, messag
     with pytest.raises(CalibrationError, match=message) as refused:
         read_lights(tmp_path / "light.mat", PHOTOS, POSED_CAMERA)
     assert "light.mat" in str(refused.value) and "Lights are read from .lp" in str(refused.value)
+
+
+def test_ground_that_most_beams_miss_does_not_set_the_scale_of_albedo():
+    """There a photo shows the room's light alone, and next to nothing of the flashlight's to divide it by."""
+    aside = tuple(replace(light, axis=np.array([0.98, 0.0, -0.2])) for light in LIGHTS)
+    for lights in (LIGHTS, aside):
+        truth = photograph(Recipe(shadows=False, noise=0.0, lights=lights))
+        found = Calibration.of(POSED_CAMERA, lights, beam=LOBE, ambient=np.full(3, AMBIENT), residuals={})
+        scaled = on_albedo_scale(found, truth.stack)
+        brightest = 0.65 * np.mean([1.0, 0.9, 0.75]) / 0.9  # of the ground, in truth, over what it is set to
+        assert scaled.lights[0].power.mean() == pytest.approx(brightest * LIGHTS[0].power.mean(), rel=0.05)

@@ -94,10 +94,10 @@ def searched(
     assert evidence.outlines is not None
     few = evidence.at(np.arange(0, len(evidence.cells.points), EVERY))
     few = replace(few, outlines=evidence.outlines.thinned(EVERY))
-    lines = [_annealed(_shaded(by_shading, few), few, BLURS)]
+    lines = [_begun(by_shading, few)]
     for number, one in enumerate(starts):
         LOG.info("fitting lights to outlines of shadows and shading, start %d of %d", number + 1, len(starts))
-        lines.append(_annealed(_shaded(replace(plain, positions=one), few), few, BLURS))
+        lines.append(_begun(replace(plain, positions=one), few))
     found = list(lines)
     for number in range(ROUNDS):
         LOG.info("fitting lights to outlines of shadows and shading, round %d of at most %d", number + 1, ROUNDS)
@@ -122,7 +122,8 @@ def _improved(best: _Found, found: Sequence[_Found], evidence: Evidence) -> list
     state = best.fit.flashlights
     mixed = _best_of_each(best, [*found, *_elsewhere(best, evidence)], evidence)
     walled = [_shaded(replace(state, wall=wall), evidence) for wall in WALLS if state.wall[2] <= 0]
-    new = [_annealed(best, evidence, AGAIN), _annealed(_judged(mixed, evidence, evidence.weight), evidence, AGAIN)]
+    misfits = best.misfit, spread(cell_residuals(mixed, evidence, evidence.weight)[evidence.weight > 0])
+    new = [_annealed(one, evidence, misfit, AGAIN) for one, misfit in zip((state, mixed), misfits, strict=True)]
     return new + [_settled(one.fit.flashlights, evidence, one.misfit) for one in _likeliest(walled, WALLED)]
 
 
@@ -162,9 +163,15 @@ def settled(start: Flashlights, evidence: Evidence) -> FlashlightFit:
     return _settled(start, evidence, _shaded(start, evidence).misfit).fit
 
 
-def _annealed(begun: _Found, evidence: Evidence, blurs: Sequence[float]) -> _Found:
-    """Return the fit from a rough state on, with outlines first blurred and then sharp."""
-    state, misfit, terms = begun.fit.flashlights, begun.misfit, evidence.outlines
+def _begun(start: Flashlights, evidence: Evidence) -> _Found:
+    """Return the fit from rough places on."""
+    begun = _shaded(start, evidence)
+    return _annealed(begun.fit.flashlights, evidence, begun.misfit, BLURS)
+
+
+def _annealed(state: Flashlights, evidence: Evidence, misfit: float, blurs: Sequence[float]) -> _Found:
+    """Return the fit with outlines first blurred and then sharp; misfit: of the shading, log units."""
+    terms = evidence.outlines
     assert terms is not None
     for blur in blurs:
         weighted = _weighted(replace(evidence, outlines=replace(terms, blur=float(blur))), misfit)

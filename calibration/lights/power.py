@@ -23,7 +23,7 @@ from capture.photos.photo import PhotoStack, read_stack, reduced
 LIT_QUANTILE = 0.6  # over photos: of a cell's brightness over its irradiance, above shadows and below highlights
 ROUNDS = 4  # of albedo and power in turn: medians settle at once
 BRIGHTEST_ALBEDO, BRIGHT_SHARE = 0.9, 99.0  # the albedo scale of CONVENTIONS.md, per cent
-FACING_QUANTILE = 0.75  # over photos: of an object pixel, those whose light it faces
+FACING_QUANTILE = 0.75  # over photos: of an object pixel's brightness, and of the light that it would face
 SHADING_MISFIT = 0.2  # median of |log brightness - log model|: right lights leave 0.05, the lights of other photos 0.4
 LONG_SIDE = 128  # px: enough for one number of a scene
 MOST_PHOTOS = 24  # evenly chosen: large photos take half a second each
@@ -85,12 +85,13 @@ def _power_scale(calibration: Calibration, stack: PhotoStack) -> float:
     """Return the factor that multiplies power so that the brightest 1 % of ground and object has albedo 0.9.
 
     Only the product of albedo and power is observed, so one of them is a choice, stated in CONVENTIONS.md and made only
-    here. An object's pixel has the albedo of a surface that faces its lights, in the upper quarter of the photos.
+    here. An object's pixel has the albedo of a surface that faces its lights: the upper quartile of its brightness over
+    that of its light. The quotient of a single photo whose beam misses the pixel is noise.
 
     Raises:
         CalibrationError: no pixel sees the ground under any light.
     """
-    ground, facing = albedo_by_photo(reduced(stack, LONG_SIDE), calibration)
+    ground, value, to_facing = albedo_by_photo(reduced(stack, LONG_SIDE), calibration)
     if not ground.size:
         raise CalibrationError(
             f"no pixel shows the ground (z = {calibration.ground_height:g}) under any light; some were needed. Check "
@@ -99,7 +100,7 @@ def _power_scale(calibration: Calibration, stack: PhotoStack) -> float:
     albedo = np.where(
         spread_between_photos(ground) < GROUND_SPREAD,
         column_quantile(ground, GROUND_LIT_QUANTILE),
-        column_quantile(facing, FACING_QUANTILE),
+        column_quantile(value, FACING_QUANTILE) / column_quantile(to_facing, FACING_QUANTILE),
     )
     return max(float(np.nanpercentile(albedo, BRIGHT_SHARE)) / BRIGHTEST_ALBEDO, 1e-12)
 
@@ -167,8 +168,9 @@ def shading_misfit(stack: PhotoStack, calibration: Calibration) -> float:
 
 def albedo_by_photo(
     stack: PhotoStack, calibration: Calibration
-) -> tuple[Float[np.ndarray, "photos pixels"], Float[np.ndarray, "photos pixels"]]:
-    """Return brightness over irradiance where rays meet the ground: on level ground, and on a surface facing the light.
+) -> tuple[Float[np.ndarray, "photos pixels"], Float[np.ndarray, "photos pixels"], Float[np.ndarray, "photos pixels"]]:
+    """Return what photos show where rays meet the ground: brightness over the light on level ground, brightness, and
+    the light on a surface that faces the flashlight; the room's is part of both.
 
     nan where clipped. Only pixels that see ground under some light are used, and photos that have a light. The photos
     must be linear.
@@ -181,7 +183,7 @@ def albedo_by_photo(
     meets = (t > 0) & np.isfinite(t)
     points = eye + t[meets, None] * rays[meets]
     up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    ground, facing = [], []
+    ground, values, facing, room = [], [], [], calibration.ambient.mean()
     for path, rgb, clipped in zip(stack.paths, stack.rgb, stack.clipped, strict=True):
         lights = [light for light in calibration.lights if light.photo == path.name]
         if not lights:
@@ -189,10 +191,11 @@ def albedo_by_photo(
         to_facing, to_ground = (_grey_irradiance(lights, points, n, calibration.beam) for n in (None, up))
         usable = ~clipped.reshape(-1)[meets] & (to_ground > 0)
         value = mean_of_channels(rgb).reshape(-1)[meets]
-        facing.append(np.where(usable, value / to_facing, np.nan))
-        ground.append(np.where(usable, value / np.where(usable, to_ground, 1.0), np.nan))
+        values.append(np.where(usable, value, np.nan))
+        facing.append(np.where(usable, to_facing + room, np.nan))
+        ground.append(np.where(usable, value / np.where(usable, to_ground + room, 1.0), np.nan))
     seen = np.isfinite(ground).any(0)
-    return np.array(ground)[:, seen], np.array(facing)[:, seen]
+    return np.array(ground)[:, seen], np.array(values)[:, seen], np.array(facing)[:, seen]
 
 
 def find_ground_height(stack: PhotoStack, calibration: Calibration) -> tuple[float, float] | None:
