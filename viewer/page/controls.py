@@ -47,7 +47,7 @@ MUTED = "opacity:.68;font-size:.82rem"
 BRAND = (214, 137, 16)
 OFF_AT_FIRST = ("Shadow hull",)
 LAYERS = {
-    "Surface": "The shape found so far, or the finished mesh",
+    "Surface": "The shape found so far",
     "Shadow hull": "The space that the shadows on the ground alone allow; the run begins with it",
     "Ground": "The plane the object stands on",
     "Camera": "Where the photos were taken from, with the chosen photo",
