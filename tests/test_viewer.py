@@ -6,7 +6,6 @@ import pytest
 
 from viewer.display.layers import light_position
 from viewer.display.run_follower import RunFollower, loss_curves, status
-from viewer.page.controls import continued
 from viewer.page.page import Page
 
 
@@ -25,15 +24,11 @@ def test_the_status_says_stage_count_and_time_left_and_that_a_run_which_let_go_h
 # --- following a run -------------------------------------------------------------------------------------------------
 
 
-def test_a_loss_that_a_line_does_not_have_is_a_gap_that_its_curve_is_drawn_through_and_never_at_zero():
+def test_a_loss_that_a_line_does_not_have_is_a_gap_of_its_curve():
     lines = [{"t": 1, "numbers": {"loss_a": 3}}, {"t": 2}, {"t": 3, "numbers": {"loss_a": 2, "loss_b": 1, "grid": 64}}]
     seconds, losses = loss_curves(lines)
     assert seconds.tolist() == [1, 3] and sorted(losses) == ["loss_a", "loss_b"]
     assert losses["loss_a"].tolist() == [3, 2] and np.isnan(losses["loss_b"][0])
-    seconds, nan = np.array([0.0, 1.0, 2.0, 3.0, 4.0]), np.nan
-    drawn = continued(seconds, np.array([nan, 4.0, nan, 1.0, 0.0]))
-    assert drawn == pytest.approx([4.0, 4.0, 2.0, 1.0, 1.0])  # half-way in the logarithm; the ends go on level
-    assert np.isnan(continued(seconds, np.full(5, nan))).all()
 
 
 def test_a_log_is_read_again_once_it_has_changed_without_lines_that_are_damaged_or_half_written(tmp_path):

@@ -15,7 +15,6 @@ import viser
 from calibration.calibrated_views import CalibratedView, load_views
 from calibration.calibration import Calibration
 from capture.errors import UserError
-from reconstruct.run_folder.folder import LOG
 from reconstruct.stored_run.maps import THUMBS
 from reconstruct.stored_run.ply import read_preview
 from reconstruct.stored_run.stored_run import CALIBRATION
@@ -36,7 +35,7 @@ from viewer.display.layers import (
     light_room,
     page_scale,
 )
-from viewer.display.run_follower import HULL, PREVIEW, RunFollower, loss_curves, status
+from viewer.display.run_follower import HULL, PREVIEW, RunFollower, status
 from viewer.page.controls import Controls
 from viewer.stage.page import is_finished
 
@@ -58,7 +57,7 @@ class Page:
         self.is_over = False
         self.controls = Controls(host, run_dir, self._show_layers, self.choose_photo)
         self.problem = ""  # a sentence about a damaged file of this run
-        self._sent, self._cpu_s = -math.inf, 0.0  # clock and CPU seconds when surface and curves were sent last
+        self._sent, self._cpu_s = -math.inf, 0.0  # clock and CPU seconds when the surface was sent last
         self._cost_s: float | None = 0.0  # CPU seconds that it took; None: not asked since
         self._lock = threading.RLock()
         self._calibration: Calibration | None = None
@@ -83,7 +82,7 @@ class Page:
             self.refresh()
 
     def _is_due(self) -> bool:
-        """Return whether surface and curves, which cost much, may be sent: a run beside this keeps the processor.
+        """Return whether the surface, which costs much, may be sent: a run beside this keeps the processor.
 
         The cost of a sending is the CPU time of the whole process until this is asked: other threads do it.
         """
@@ -91,18 +90,14 @@ class Page:
             self._cost_s = time.process_time() - self._cpu_s
         return time.monotonic() - self._sent >= max(MIN_INTERVAL_S, COST_FACTOR * self._cost_s)
 
-    def _begin_sending(self) -> None:
-        if self._cost_s is not None:  # else what goes with this is being sent already
-            self._sent, self._cpu_s, self._cost_s = time.monotonic(), time.process_time(), None
-
     def refresh(self) -> None:
         """Read the folder once and show what is new."""
         with self._lock:
             lines = self.follower.log()
             now = status(lines, self.follower.is_running(), self.follower.since_last_line_s())
-            self.is_over, is_due = now.is_over, now.is_over or self._is_due()
+            self.is_over = now.is_over
             try:
-                self._read_results(is_due)
+                self._read_results()
             except UserError as error:  # a damaged file: the page shows this and goes on
                 self.problem = str(error)
             if self._awaits_thumbnail:
@@ -110,17 +105,12 @@ class Page:
             elif self._calibration is None and self.follower.changed(THUMBS):
                 self._show_read_photo()
             self.controls.follow(now, lines, self.problem, now.is_finished and is_finished(self.follower.path))
-            if is_due and self.follower.changed(LOG):
-                seconds, losses = loss_curves(lines)
-                if len(seconds) > 1:
-                    self._begin_sending()
-                    self.controls.show_losses(seconds, losses)
 
-    def _read_results(self, is_due: bool) -> None:
+    def _read_results(self) -> None:
         if self.follower.changed(CALIBRATION):
             self._show_calibration()
-        if is_due and self._calibration and self.follower.changed(PREVIEW):
-            self._begin_sending()
+        if self._calibration and (self.is_over or self._is_due()) and self.follower.changed(PREVIEW):
+            self._sent, self._cpu_s, self._cost_s = time.monotonic(), time.process_time(), None
             self._show_mesh(self._calibration)
         if self._calibration and self.follower.changed(HULL):
             hull = read_preview(self.follower.path / HULL)
