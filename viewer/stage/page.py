@@ -110,7 +110,7 @@ def page_html(
         saves: how its document can be kept with the run: "socket" (WebSocket stage.json of its server, which also makes
             other kinds of files), "frame" (a message to the page around it, as this one has no origin); "": it cannot.
         home: address of the page that led here, for a link back; "": none.
-        fault: the verdict on a result that is not good; in a "frame" the page around it says it.
+        fault: the verdict on a result that is not good; in a "frame" the page around it says this, title and size.
     """
     is_served = saves == "socket"
     kinds = {part: "image/jpeg" if part.endswith(".jpg") else "application/octet-stream" for part in pack.names}
@@ -118,7 +118,8 @@ def page_html(
     values = {
         "title": html.escape(name),
         "size": html.escape(str(facts["size"])),
-        "fault": html.escape(fault) if saves != "frame" else "",
+        "header": "hidden" if saves == "frame" else "",
+        "fault": html.escape(fault),
         "policy": page_policy("'self'" if is_served else "'none'"),
         "style": _asset("stage.css"),
         "first": html.escape(facts["addresses"]["first"]),

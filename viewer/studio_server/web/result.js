@@ -1,4 +1,4 @@
-// Runs: those that wait for this machine, the progress of one, its result once it is finished, two results side by side.
+// Runs: those that wait for this machine, the progress of one, its result once it is finished.
 
 import { about, ask, attempt, bytes, change, changed, dialog, duration, failure, h, key, plural, presetWords, rename } from "./dom.js";
 import { saving } from "./save.js";
@@ -83,7 +83,7 @@ export function run(name, again) {
   function result(one) {
     return h("div", {},
       one.has_mesh ? stage(one) : h("p", { class: "bad" }, "This run has no result that could be shown: its mesh is missing. Start it again."),
-      h("div", { class: "bar" }, one.has_mesh && saver.share(), one.has_mesh && h("button", { onclick: fill }, "Fill the window"),
+      h("div", { class: "bar" }, one.has_mesh && h("button", { onclick: fill }, "Fill the window"),
         one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report")),
       facts(one),
       one.scale && h("p", { class: "quiet" }, one.scale),
@@ -161,33 +161,3 @@ addEventListener("message", async ({ source, data }) => {
   } catch { kept = "the studio does not answer"; }
   source.postMessage({ kept }, "*");
 });
-
-const KEYS = /^(Arrow\w+|[-+=?lL0-9])$/; // of the stage
-
-/** While a button of this page has the focus, the stage's keys go to the results all the same. */
-addEventListener("keydown", (event) => {
-  const isBrowsers = event.altKey || event.metaKey || (event.ctrlKey && !event.key.startsWith("Arrow"));
-  const isTaken = event.defaultPrevented || isBrowsers || event.target.closest("input, select, textarea, dialog");
-  const frames = document.querySelectorAll("iframe.result");
-  if (isTaken || !frames.length || !KEYS.test(event.key)) return;
-  event.preventDefault();
-  if (event.key === "?") frames[0].focus(); // Escape then closes the list of keys
-  for (const one of frames) one.contentWindow.postMessage({ press: { key: event.key, shiftKey: event.shiftKey, ctrlKey: event.ctrlKey } }, "*");
-});
-
-export function compare(names) {
-  const view = { pause: 5000, wide: true };
-  view.render = async (ask) => {
-    const state = await ask("/api/state");
-    const runs = state.cards.flatMap((card) => card.runs);
-    const two = names.split("|").map(decodeURIComponent).map((name) => runs.find((one) => one.key === name));
-    if (two.length !== 2 || two.some((one) => !one || one.state !== "finished")) throw new Error("Two finished runs are needed to compare; one of these is not finished, or not here any more.");
-    document.title = `${two[0].title} and ${two[1].title} · Shadowgraph studio`;
-    return [
-      h("div", { class: "bar" }, h("h1", { class: "grow" }, `${two[0].title} and ${two[1].title}`), h("a", { class: "button", href: "#/" }, "All captures")),
-      h("div", { class: "pair" }, two.map((one) => h("div", { key: one.key }, h("h2", {}, one.title), stage(one),
-        facts(one)))),
-    ];
-  };
-  return view;
-}
