@@ -56,7 +56,7 @@ LAYERS = {
 }
 TO_STAGE = (
     '<div style="padding:0 .8rem .7rem"><a href="/stage/" target="_self" style="color:inherit;font-weight:600">'
-    "Open the result: to light, turn, measure, note and save</a></div>"
+    "Open the result: to light, turn, measure and note</a></div>"
 )
 
 

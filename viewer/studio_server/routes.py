@@ -18,7 +18,7 @@ from calibration.board.printing import DEFAULT_BOARDS, PAPERS, BoardPage, draw_p
 from capture.errors import CaptureError
 from capture.files.regular import is_regular, read_regular
 from reconstruct.stored_run.stage_document import save_stage_document
-from viewer.stage.files import HEADERS, HTML
+from viewer.page.guard import HTML, STAGE_HEADERS
 from viewer.stage.page import page_of, page_policy
 from viewer.studio.library import example_page
 from viewer.studio.studio import Studio
@@ -36,7 +36,7 @@ BOARDS = (  # text of session.toml ("": none), title, about
 )
 SAVED = ("format", "size")  # what a request for another kind of file names beside the run
 LARGEST_PICTURE = 1 << 22  # bytes of a run under way: ours have 100 kB
-STAGED = HEADERS | {  # of a page that runs the stage's script, and saves pictures and notes
+STAGED = STAGE_HEADERS | {  # of a page that runs the stage's script, and saves pictures and notes
     "Content-Security-Policy": f"sandbox allow-scripts allow-downloads allow-forms; {page_policy()}; "
     "frame-ancestors 'self'"
 }
