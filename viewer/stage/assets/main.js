@@ -12,15 +12,14 @@ import { isNarrow, openPanel, panelMoved, showLamp, showSaved, showShown, showSt
 
 const SETTLED_MS = 250;
 const ROOMY = 1100;                  // px of a window in which the panel is open at first
-const EDGE = 20;                     // px
 const LAMP_SAID_MS = 200;
 let pointerAt = 0, settling = 0, lampWaits = 0;
 
-// The part of the window that nothing lies over: below the title, above buttons and legend, and above an open panel or left of it.
+// The part of the window that nothing lies over: below title and buttons, above buttons and legend, beside or above an open panel.
 function freePart() {
-  const [header, modes, legend, panel] = ["header", "#modes", "#legend", "#panel"].map((name) => document.querySelector(name).getBoundingClientRect());
+  const [header, tools, modes, legend, panel] = ["header", "#tools", "#modes", "#legend", "#panel"].map((name) => document.querySelector(name).getBoundingClientRect());
   const tops = [modes, legend, isNarrow() ? panel : {}].filter((box) => box.height).map((box) => box.top);  // what is hidden has no height
-  const top = Math.max(EDGE, header.bottom), bottom = Math.min(innerHeight - EDGE, ...tops);
+  const top = Math.max(header.bottom, tools.bottom), bottom = Math.min(innerHeight, ...tops);
   const width = panel.height && !isNarrow() ? panel.left : innerWidth;
   return bottom - top < innerHeight / 4 ? { left: 0, top: 0, width, height: innerHeight } : { left: 0, top, width, height: bottom - top };
 }
