@@ -9,7 +9,7 @@ from pathlib import Path
 from reconstruct.stored_run.stage_pack import stage_archive
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.stage.parts import facts_and_parts
-from viewer.studio.library import RESULT
+from viewer.studio.library import EXAMPLE_RESULT
 
 
 def main() -> None:
@@ -19,7 +19,7 @@ def main() -> None:
     for name in facts["addresses"]["photos"].values():
         parts.pop(name)
     facts["addresses"]["photos"] = {}
-    RESULT.write_bytes(stage_archive(run, facts, parts))
+    EXAMPLE_RESULT.write_bytes(stage_archive(run, facts, parts))
 
 
 if __name__ == "__main__":

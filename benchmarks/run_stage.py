@@ -21,7 +21,7 @@ from playwright.sync_api import sync_playwright
 from sheet import Sheet, parser_of
 
 from viewer.page.guard import GuardedServer
-from viewer.stage.files import StageFiles
+from viewer.stage.page import stage_pack
 
 WINDOWS = ({"width": 800, "height": 600}, {"width": 390, "height": 844}, {"width": 1600, "height": 1000})
 MOVES, PAUSE_S = 60, 0.03
@@ -108,9 +108,8 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("run", type=Path, help="the folder of a finished run")
     asked = parser.parse_args()
-    files = StageFiles(asked.run)
-    files.warm()
-    server = GuardedServer("127.0.0.1", 0, files)
+    stage_pack(asked.run)
+    server = GuardedServer("127.0.0.1", 0, asked.run)
     path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
     address = f"http://localhost:{server.get_port()}/stage/"
     with sync_playwright() as playwright:

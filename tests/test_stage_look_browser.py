@@ -132,9 +132,8 @@ def test_the_object_fills_the_part_of_the_window_that_is_free(run, window, size)
         free_right = panel[0]["x"] if is_open and not is_narrow else width
         free_bottom = panel[0]["y"] if is_open and is_narrow else height
         assert left >= -1 and top >= -1 and right <= free_right + 1 and bottom <= free_bottom + 1
-        if is_narrow:
-            for box in boxes(tab, "header", "#tools", "#modes"):
-                assert box["y"] + box["height"] <= top + 1 or box["y"] >= bottom - 1 or is_open
+        for box in boxes(tab, "header", "#tools", "#modes"):
+            assert box["y"] + box["height"] <= top + 1 or box["y"] >= bottom - 1 or (is_open and is_narrow)
         if not isinstance(turn, float) and not (is_open and is_narrow):
             filled = max((right - left) / free_right, (bottom - top) / free_bottom)
             assert filled > 0.8 or (is_narrow and (bottom - top) / free_bottom > 0.6)

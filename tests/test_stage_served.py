@@ -1,7 +1,6 @@
 """The stage beside viser's page: served to its own page only, with its parts, and its notes kept with the run."""
 
 import json
-import time
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,6 @@ from studio_client import Client
 from capture.errors import CalibrationError
 from reconstruct.stored_run.stage_document import EMPTY, LARGEST, parsed_stage, read_stage_document, save_stage_document
 from viewer.page.guard import GuardedServer
-from viewer.stage.files import StageFiles
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +20,7 @@ def run(finished_run, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def address(run):
-    server = GuardedServer("127.0.0.1", 0, StageFiles(run))
+    server = GuardedServer("127.0.0.1", 0, run)
     yield f"127.0.0.1:{server.get_port()}"
     server.stop()
 
@@ -50,23 +48,6 @@ def test_notes_come_through_the_socket_into_the_run(address, run):
     found = read_stage_document(run)
     assert found is not None and found["notes"][0]["text"] == "here"
     (run / "stage.json").unlink()
-
-
-def test_the_result_is_saved_as_other_kinds_of_files_and_as_no_unknown_one(address):
-    page = asked(address, "/stage/")[1].decode()
-    for kind, begins in (("ply", b"ply"), ("normal-png", b"PK")):
-        assert f'"{kind}":[' in page
-        content = eventually(address, f"/stage/save/{kind}")
-        assert len(content) > 1000 and content.startswith(begins)
-    for kind in ("exe", "../report.json", ""):
-        assert asked(address, f"/stage/save/{kind}")[0] == 404
-
-
-def eventually(address: str, path: str) -> bytes:
-    """What comes once it is made; until then it is a page that says so."""
-    while (content := asked(address, path)[1]).startswith(b"<!doctype html>"):
-        time.sleep(0.2)
-    return content
 
 
 @pytest.mark.browser

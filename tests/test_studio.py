@@ -20,7 +20,7 @@ from reconstruct.export.export import default_file
 from reconstruct.run_folder.lock import release_lock, take_lock
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.report.report import read_results
-from viewer.stage.files import StageFiles
+from viewer.stage.page import page_of, stage_pack
 from viewer.studio.folder import StudioFolder, Trash
 from viewer.studio.library import counts_of
 from viewer.studio_server.serve import serve
@@ -307,10 +307,9 @@ def test_results_reports_pages_and_files_have_the_title(finished_run, tmp_path):
     keep_title(run, title)
     assert StoredRun(run).name == read_results(run).name == title
     assert default_file(run, "glb").stem == as_name(title, "")
-    page = StageFiles(run).get("")
+    page = page_of(run, stage_pack(run))
     escaped = title.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    assert page is not None and f"<title>{escaped}" in page[0].decode()
-    assert "<cup>" not in page[0].decode()
+    assert f"<title>{escaped}" in page and "<cup>" not in page
 
 
 @pytest.mark.parametrize("content", [b"", b" \n\t ", b"\x00\x07", b"x" * 100_000, b"\xff\xfe"])

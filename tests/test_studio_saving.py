@@ -8,11 +8,9 @@ import time
 from concurrent.futures import Future
 from urllib.parse import quote
 
-import fake_run
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
 from studio_client import Client, served
 from test_studio import capture_in
 from waiting import wait_until
@@ -107,25 +105,6 @@ def test_a_video_says_how_far_it_is_lets_others_pass_and_is_cancelled(folder):
         assert not list((folder / ".studio" / "saved").iterdir())
         owner.ok("save", key=RUN, format="turntable", size="")
         wait_until(lambda: (row_of(owner, "turntable").get("share") or 0.0) > 0.0)  # after a cancelled one
-
-
-def test_a_run_under_way_shows_its_photos_and_then_the_growing_surface(tmp_path, truth):
-    run = tmp_path / "runs" / "heap"
-    fake_run.start_run(run, truth)
-    (run / "preview.ply").rename(run / "later.ply")
-    with served(tmp_path) as (studio, _, owner):
-        marks, pictures = [], []
-        for _ in range(2):
-            row = owner.get("/api/state")[1]["cards"][0]["runs"][0]
-            marks.append(row["growing"])
-            wait_until(lambda: studio.growing_picture("runs/heap") and not studio._growing._pending)
-            pictures.append(np.asarray(Image.open(io.BytesIO(owner.raw("GET", "/api/growing?key=runs/heap").content))))
-            studio._growing._answers.clear()  # as if some seconds had gone
-            if (run / "later.ply").exists():
-                (run / "later.ply").rename(run / "preview.ply")
-    assert all(marks) and marks[0] != marks[1]
-    assert pictures[0].shape == pictures[1].shape == (480, 640, 3)
-    assert np.abs(pictures[0].astype(int) - pictures[1]).mean() > 5 and pictures[1].std() > 10
 
 
 def test_the_queue_says_what_each_run_costs_and_what_is_left(tmp_path, monkeypatch):

@@ -44,7 +44,7 @@ def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp
         look("running")
         before = tab.inner_text("#clock")
         wait_until(tab, lambda: tab.inner_text("#clock") != before)
-        tab.wait_for_selector("img.growing:not([hidden])")
+        tab.wait_for_selector("text=Watch it grow in 3D")
         look("growing")
         tab.click("text=All captures")
         tab.wait_for_selector("section.queue")

@@ -3,12 +3,9 @@ import os
 import fake_run
 import numpy as np
 import pytest
-import trimesh
 
-from viewer.display import layers
-from viewer.display.layers import FIRST_FOV, framed_view, light_position, page_mesh, page_scale
+from viewer.display.layers import light_position
 from viewer.display.run_follower import RunFollower, loss_curves, status
-from viewer.page.controls import continued
 from viewer.page.page import Page
 
 
@@ -27,25 +24,11 @@ def test_the_status_says_stage_count_and_time_left_and_that_a_run_which_let_go_h
 # --- following a run -------------------------------------------------------------------------------------------------
 
 
-def test_a_loss_that_a_line_does_not_have_is_a_gap_that_its_curve_is_drawn_through_and_never_at_zero():
+def test_a_loss_that_a_line_does_not_have_is_a_gap_of_its_curve():
     lines = [{"t": 1, "numbers": {"loss_a": 3}}, {"t": 2}, {"t": 3, "numbers": {"loss_a": 2, "loss_b": 1, "grid": 64}}]
     seconds, losses = loss_curves(lines)
     assert seconds.tolist() == [1, 3] and sorted(losses) == ["loss_a", "loss_b"]
     assert losses["loss_a"].tolist() == [3, 2] and np.isnan(losses["loss_b"][0])
-    seconds, nan = np.array([0.0, 1.0, 2.0, 3.0, 4.0]), np.nan
-    drawn = continued(seconds, np.array([nan, 4.0, nan, 1.0, 0.0]))
-    assert drawn == pytest.approx([4.0, 4.0, 2.0, 1.0, 1.0])  # half-way in the logarithm; the ends go on level
-    assert np.isnan(continued(seconds, np.full(5, nan))).all()
-
-
-def test_the_final_mesh_is_shown_once_it_is_this_runs_whatever_the_dates_of_the_files(tmp_path):
-    follower = RunFollower(tmp_path)
-    assert follower.mesh_name([]) is None
-    (tmp_path / "mesh.ply").write_text("of an older run")
-    assert follower.mesh_name([{"stage": "solve/64"}]) is None
-    (tmp_path / "preview.ply").write_text("newer")
-    assert follower.mesh_name([{"stage": "solve/64"}]) == "preview.ply"
-    assert follower.mesh_name([{"stage": "done"}]) == follower.mesh_name([]) == "mesh.ply"
 
 
 def test_a_log_is_read_again_once_it_has_changed_without_lines_that_are_damaged_or_half_written(tmp_path):
@@ -71,38 +54,6 @@ def test_a_folder_in_which_nothing_changes_has_no_news(tmp_path):
     assert follower.has_news()
 
 
-# --- what is drawn ---------------------------------------------------------------------------------------------------
-
-
-def test_a_mesh_of_very_many_triangles_is_simplified_for_the_page(tmp_path, monkeypatch):
-    monkeypatch.setattr(layers, "MOST_FACES", 30_000)
-    ball = trimesh.creation.icosphere(subdivisions=6, radius=30.0)
-    ball.visual.vertex_colors = np.tile(np.array([[200, 160, 120, 255]], np.uint8), (len(ball.vertices), 1))
-    ball.export(tmp_path / "mesh.ply")
-    shown = page_mesh(tmp_path / "mesh.ply")
-    assert len(ball.faces) > 80_000 and 30_000 >= len(shown.faces) > 10_000
-    np.testing.assert_allclose(np.ptp(shown.vertices, axis=0), ball.extents, rtol=0.01)
-
-
-@pytest.mark.parametrize("aspect", [1.6, 1.0, 0.46])
-def test_a_finished_object_fills_a_third_of_the_shorter_side_and_more(truth, aspect):
-    scale, bounds = page_scale(truth.calibration), np.array([[-40.0, -30, 0], [20, 25, 60]])
-    eye, target = framed_view(bounds, truth.calibration, scale, aspect)
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    up = np.cross(right, forward)
-    corners = np.array([[x, y, z] for x in bounds[:, 0] for y in bounds[:, 1] for z in bounds[:, 2]])
-    away = scale.to_page(corners) - eye
-    across, high = (away @ right / (away @ forward), away @ up / (away @ forward))
-    half = np.tan(0.5 * FIRST_FOV)
-    assert np.abs(across).max() < half * aspect and np.abs(high).max() < half  # all of it is in the window
-    shorter = 2 * half * min(1.0, aspect)
-    assert max(np.ptp(across), np.ptp(high)) / shorter > 0.35
-    if aspect < 1:
-        assert high.min() > -0.1 * half  # above what the panels cover
-
-
 # --- the page as a whole ---------------------------------------------------------------------------------------------
 
 
@@ -121,7 +72,7 @@ def test_the_page_follows_a_run_from_nothing_to_the_way_to_its_stage(tmp_path, t
     assert page.controls._status.content != before, "its clock stands still between two lines of the log"
     fake_run.finish_run(tmp_path, truth)
     page.refresh()
-    assert page.is_over and "/stage/" in page.controls._status.content and " mm" in page.controls._status.content
+    assert page.is_over and "/stage/" in page.controls._status.content
     page.choose_photo(4)
     np.testing.assert_allclose(page._lamp.handle.position, light_position(page._lights[4].light, page._scale))
     assert truth.calibration.lights[4].photo in page.controls._caption.content

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from chromium import Followed, brown, canvas_picture, canvas_pixels, open_page, wait_until
 
-from viewer.display.layers import first_view
 from viewer.report.report import write_report
 
 pytestmark = pytest.mark.browser
@@ -56,7 +55,6 @@ def test_the_lamp_is_dragged_and_the_surface_shows_its_light(browser, followed):
     wait_until(tab, lambda: page._lights[4].bulb.scale == 1.5)
     place = np.array(page._lamp.handle.position)
     np.testing.assert_allclose(place, page._lights[4].bulb.position)
-    page._look(*first_view(page._calibration, page._scale))  # a finished object is shown close, its lamp out of view
     before = canvas_pixels(tab)  # dragged by the blue arrow, upwards
     v, u = np.nonzero((before[..., 2] - before[..., 0] > 120) & (before[..., 2] > 200))
     box, top = tab.locator("canvas").first.bounding_box(), np.argmin(v)

@@ -6,8 +6,6 @@ A Host is the server, whose scene all browsers share, or one browser, which then
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import viser
@@ -18,7 +16,7 @@ from calibration.calibration import Calibration
 from calibration.light import Light
 from capture.photos.photo import decode_srgb
 from reconstruct.mesh.glb import write_glb
-from reconstruct.stored_run.ply import Triangles, read_mesh, read_triangles
+from reconstruct.stored_run.ply import Triangles
 
 Host = viser.ViserServer | viser.ClientHandle
 
@@ -33,11 +31,8 @@ HULL_COLOUR, HULL_OPACITY = (126, 168, 255), 0.3
 BLACK, WHITE = (0, 0, 0), (255, 255, 255)
 FROM_BELOW = ((200, 190, 180), 2.0)  # colour and strength of what a table in daylight throws back
 BY_NIGHT = ((90, 85, 80), 0.7)  # so that what the lamp does not reach is neither black nor flat
-CLAY = (200, 160, 120)  # of the growing mesh: its own colours come at the end, and the ground is grey
-MOST_FACES = 400_000  # above this a mesh is simplified for the page only: 12 MB a time
+CLAY = (200, 160, 120)  # of a mesh without colours: the ground is grey
 FIRST_FOV = float(np.radians(55.0))  # vertical
-RAISED = 0.58  # of half the height of an upright window: how far above its middle the object is shown
-FRAMED = 0.75  # of the window's shorter side, by the sphere around a finished object
 FIRST_TURN, FLATTER = np.radians(42.0), (1.0, 1.0, 0.6)  # the first view stands beside the camera, lower: it is seen
 FIRST_FARTHEST = 1.7 * CAMERA_DISTANCE  # shows most lights; farther, the object is small
 FIRST_RAISED = 0.3 * CAMERA_DISTANCE
@@ -84,27 +79,6 @@ def _beside(way: Float[np.ndarray, "3"], turn: float) -> Float[np.ndarray, "3"]:
     """Return the unit vector of a direction that was turned about the vertical, rad."""
     c, s = np.cos(turn), np.sin(turn)
     return np.array([c * way[0] - s * way[1], s * way[0] + c * way[1], way[2]]) / np.linalg.norm(way)
-
-
-def framed_view(
-    bounds: Float[np.ndarray, "2 3"], calibration: Calibration, scale: PageScale, aspect: float
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Choose eye and target on the page so that an object fills FRAMED of the window's shorter side.
-
-    In an upright window, as of a phone, it comes to lie above the panels, which cover the lower part.
-
-    Args:
-        bounds: lower and upper corner of the object, world.
-        aspect: of the window, width over height.
-    """
-    low, high = scale.to_page(bounds)
-    target, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
-    back = _beside(scale.to_page(calibration.world_from_camera.translation) - target, 0.5 * FIRST_TURN)
-    distance = radius / np.sin(np.arctan(FRAMED * np.tan(0.5 * FIRST_FOV) * min(1.0, aspect)))
-    if aspect < 1:
-        up = np.array([0.0, 0.0, 1.0]) - back[2] * back  # on the picture
-        target = target - up / max(float(np.linalg.norm(up)), 1e-9) * RAISED * distance * np.tan(0.5 * FIRST_FOV)
-    return target + back * distance, target
 
 
 def light_room(host: Host, has_lamp: bool) -> None:
@@ -224,26 +198,8 @@ def draw_light(host: Host, index: int, light: Light, scale: PageScale) -> LightM
     return LightMarker(light, bulb, halo)
 
 
-@lru_cache(maxsize=1)  # for all windows that look at a run; `mark` changes with the file
-def page_mesh(path: Path, mark: tuple[int, int] = (0, 0)) -> Triangles:
-    """Read a finished mesh, simplified where it has more triangles than a browser shows at once.
-
-    Raises:
-        ReconstructionError: it is none that a run writes.
-    """
-    found = read_triangles(path)
-    if len(found.faces) <= MOST_FACES:
-        return found  # without torch: beside a run its import would be felt
-    from reconstruct.mesh.mesh import vertex_colours
-    from reconstruct.mesh.simplify import simplified
-
-    mesh = simplified(read_mesh(path), MOST_FACES)
-    places, normals = (np.asarray(v, np.float32) for v in (mesh.vertices, mesh.vertex_normals))
-    return Triangles(places, np.asarray(mesh.faces, np.int32), normals, np.asarray(vertex_colours(mesh)))
-
-
 def draw_mesh(host: Host, mesh: Triangles, scale: PageScale, visible: bool) -> viser.MeshHandle | viser.GlbHandle:
-    """Draw the surface, growing or finished: in the colours of the photos, or like clay where it has none yet."""
+    """Draw the growing surface: in the colours of the photos, or like clay where it has none."""
     if mesh.colours is not None and mesh.normals is not None:
         glb = write_glb(mesh.vertices, mesh.normals, decode_srgb(mesh.colours[:, :3]), mesh.faces)
         return host.scene.add_glb("/mesh", glb, scale=scale.factor, visible=visible)

@@ -16,7 +16,7 @@ from reconstruct.run_folder.forecast import STAGE_NAMES, Forecast
 from reconstruct.run_folder.lock import LOCK, lock_holder
 from reconstruct.run_folder.requests import PAUSED, REQUESTS_FOLDER
 from reconstruct.stored_run.maps import THUMBS, read_thumbnail
-from reconstruct.stored_run.stored_run import CALIBRATION, FIELDS, MESH
+from reconstruct.stored_run.stored_run import CALIBRATION
 
 FIT_WORDS = {
     "loss_shadow": ("Shadows", "How far computed shadows are from those in the photos."),
@@ -27,8 +27,7 @@ FIT_WORDS = {
 }
 
 HULL, PREVIEW = "hull.ply", "preview.ply"
-SHOWN = (LOG, LOCK, CALIBRATION, PREVIEW, HULL, MESH, FIELDS, THUMBS, REQUESTS_FOLDER)  # on a page
-AFTER_MESH = ("detail", "report", "done")  # stages that find this run's mesh.ply; before, it may be an older run's
+SHOWN = (LOG, LOCK, CALIBRATION, PREVIEW, HULL, THUMBS, REQUESTS_FOLDER)  # on a page
 
 
 @dataclass(frozen=True)
@@ -97,18 +96,6 @@ class RunFollower:
         mark = self._mark(LOG) or self._mark(LOCK)
         return max(0.0, time.time() - mark[0] / 1e9) if mark else 0.0
 
-    def mesh_name(self, lines: Sequence[Mapping[str, Any]]) -> str | None:
-        """Return which mesh to show after these lines of the log: the growing one until the final one is written.
-
-        Not by their dates: a copied run folder has others.
-        """
-        order = (MESH, PREVIEW) if stage_of(lines) in AFTER_MESH else (PREVIEW,)
-        return next((name for name in order if (self.path / name).exists()), None)
-
-    def has_result(self, lines: Sequence[Mapping[str, Any]]) -> bool:
-        """Return whether the surface of this run is written, and not only that of an older run in the same folder."""
-        return stage_of(lines) in AFTER_MESH and (self.path / FIELDS).exists()
-
     def thumbnail(self, photo: str) -> np.ndarray | None:
         """Return the small sRGB picture of a photo, (H, W, 3) uint8; None where there is none that can be read."""
         try:
@@ -120,11 +107,6 @@ class RunFollower:
         """Return the names of the small pictures of photos that are there, in order."""
         folder = self.path / THUMBS
         return sorted(path.name for path in folder.glob("[!.]*.jpg")) if is_own_folder(folder) else []
-
-
-def stage_of(lines: Sequence[Mapping[str, Any]]) -> str:
-    """Return the stage that a log ends in; "done" where the folder has no log."""
-    return str(lines[-1].get("stage", "")).split("/")[0] if lines else "done"
 
 
 def status(lines: list[dict[str, Any]], is_running: bool, since_last_line_s: float = 0.0) -> Status:

@@ -1,4 +1,4 @@
-"""Controls: the status, the steering, the photos, the layers and the curves of the page. They handle no geometry.
+"""Controls: the status, the steering, the photos and the layers of the page. They handle no geometry.
 
 Steering: pause, go on, next level, stop and save, another resolution, as requests in the folder of the run.
 """
@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import viser
-import viser.uplot
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from capture.files.title import title_of
 from reconstruct.run_folder.forecast import duration_text, left_text
@@ -26,7 +25,7 @@ from reconstruct.run_folder.requests import (
     withdraw,
 )
 from viewer.display.layers import Host
-from viewer.display.run_follower import RunFollower, Status, residual_text
+from viewer.display.run_follower import RunFollower, Status
 
 QUIET = (74, 78, 88)  # sRGB of a button that is not the main one
 AS_PLANNED = "as planned"
@@ -47,7 +46,7 @@ MUTED = "opacity:.68;font-size:.82rem"
 BRAND = (214, 137, 16)
 OFF_AT_FIRST = ("Shadow hull",)
 LAYERS = {
-    "Surface": "The shape found so far, or the finished mesh",
+    "Surface": "The shape found so far",
     "Shadow hull": "The space that the shadows on the ground alone allow; the run begins with it",
     "Ground": "The plane the object stands on",
     "Camera": "Where the photos were taken from, with the chosen photo",
@@ -57,9 +56,8 @@ LAYERS = {
 }
 TO_STAGE = (
     '<div style="padding:0 .8rem .7rem"><a href="/stage/" target="_self" style="color:inherit;font-weight:600">'
-    "Open the result: to light, turn, measure, note and save</a></div>"
+    "Open the result: to light, turn, measure and note</a></div>"
 )
-CURVE_COLOURS = ("#f5a524", "#5b9dff", "#4cc38a", "#e5709b", "#a78bfa", "#9aa3b2", "#22c1c3", "#e46c3b")
 
 
 class Steering:
@@ -136,12 +134,11 @@ class Controls:
         """
         self._gui = gui = host.gui
         self._change_layers = change_layers
-        self._curves: viser.GuiUplotHandle | None = None
-        self._curve_names: tuple[str, ...] = ()
         gui.set_panel_label(f"Shadowgraph · {title_of(run_dir)}")
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
         self._status = gui.add_html("")
+        self._bar = gui.add_progress_bar(0, color=BRAND)
         self.steering = Steering(gui, run_dir)
         self._photo_folder = gui.add_folder("Photos", visible=False)
         with self._photo_folder:
@@ -154,7 +151,6 @@ class Controls:
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=BRAND)
         for box in self._layers.values():
             box.on_update(lambda _: self._change_layers())
-        self._curve_folder = gui.add_folder("How well it fits", expand_by_default=False, visible=False)
 
     # --- what is read from the controls ------------------------------------------------------------------------------
 
@@ -171,6 +167,7 @@ class Controls:
     def follow(self, now: Status, lines: Sequence[Mapping[str, Any]], remark: str, has_picture: bool) -> None:
         """Show stage, n of m, time left and message, the steering, a remark or problem, and the way to the stage."""
         self._status.content = _status_card(now, remark, self.steering.follow(now, lines)) + TO_STAGE * has_picture
+        self._bar.visible, self._bar.value = not now.is_over, 100 * (now.share or 0.0)
 
     def show_photo(self, index: int, count: int, words: str, picture: UInt8[np.ndarray, "h w 3"] | None) -> None:
         """Show one of `count` photos, with a line about it; None: there is no picture of it yet."""
@@ -186,57 +183,14 @@ class Controls:
             self._photo.image = picture
         self._caption.content = f'<div style="padding:0 .8rem .5rem;{MUTED}">{html.escape(words)}</div>'
 
-    def show_losses(self, seconds: np.ndarray, losses: dict[str, np.ndarray]) -> None:
-        """Plot each term of the loss over seconds."""
-        names = tuple(losses)
-        data = (seconds, *(continued(seconds, values) for values in losses.values()))
-        if self._curves is not None and names == self._curve_names:
-            self._curves.data = data
-            return
-        if self._curves is not None:
-            self._curves.remove()
-        self._curve_names = names
-        self._curve_folder.visible = True
-        with self._curve_folder:
-            self._curves = self._gui.add_uplot(
-                data,
-                series=(
-                    viser.uplot.Series(label="seconds"),
-                    *(
-                        viser.uplot.Series(label=residual_text(name)[0], stroke=colour, width=2, spanGaps=True)
-                        for name, colour in zip(names, CURVE_COLOURS * len(names), strict=False)
-                    ),
-                ),
-                scales={"x": viser.uplot.Scale(time=False, auto=True), "y": viser.uplot.Scale(distr=3, auto=True)},
-                aspect=1.3,
-            )
-
-
-def continued(seconds: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return positive values at all seconds, drawn straight on a logarithmic scale between those that are known.
-
-    A term that is measured now and then has nan in between, which the page's plot would draw as zero, a comb.
-    """
-    known = np.isfinite(values) & (values > 0)
-    if not known.any():
-        return np.full(len(values), np.nan)
-    return np.exp(np.interp(seconds, seconds[known], np.log(values[known])))
-
 
 def _status_card(now: Status, *remarks: str) -> str:
     """Return the status as HTML. Text from files is escaped: a photo's name must not become part of the page."""
-    bar = ""
-    if not now.is_over:
-        width = 100 * (now.share or 0.0)
-        bar = (
-            '<div style="height:6px;border-radius:3px;background:rgba(128,128,128,.25);margin:.5rem 0 .35rem">'
-            f'<div style="height:6px;border-radius:3px;width:{width:.0f}%;background:rgb{BRAND}"></div></div>'
-        )
     took = duration_text(now.elapsed_s)
     facts = [now.counts, f"took {took}"] if now.is_over else [now.counts, left_text(now.left_s), f"{took} so far"]
     lines = [" · ".join(f for f in facts if f), now.message, *remarks]
     body = "".join(f'<div style="{MUTED};margin-top:.15rem">{html.escape(line)}</div>' for line in lines if line)
     return (
         '<div style="padding:.55rem .8rem .7rem">'
-        f'<div style="font-size:1.12rem;font-weight:600">{html.escape(now.title)}</div>{bar}{body}</div>'
+        f'<div style="font-size:1.12rem;font-weight:600">{html.escape(now.title)}</div>{body}</div>'
     )

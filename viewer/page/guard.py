@@ -22,6 +22,7 @@ import ipaddress
 import secrets
 import socket
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -35,7 +36,7 @@ from websockets.http11 import Request, Response
 
 from capture.errors import UserError
 from reconstruct.stored_run.stage_document import save_stage_document
-from viewer.stage.files import HEADERS, HTML, SAFE_HEADERS, StageFiles
+from viewer.stage.page import page_of, stage_pack
 
 LARGEST = 1 << 16  # bytes of one message: decoded, it may need a hundred times its size
 VALUE = "GuiUpdateMessage"  # a control was moved or pressed
@@ -49,10 +50,6 @@ KINDS = (
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 PAGE = ("/", "/index.html")  # viser's page is one file
 STAGE, STAGE_DOCUMENT = "/stage/", "/stage/stage.json"  # the run as a picture, beside viser's page
-PACKING_S = 6.0  # seconds that a request waits for a run's picture to be packed
-PACKING = (
-    b'<!doctype html><meta http-equiv="refresh" content="2"><title>Shadowgraph</title><p>The page is being prepared.'
-)
 TOKEN_BYTES = 24
 VISER_TITLE = b"<title>Viser</title>"
 # viser draws a white page until it hears of its theme: until then, for at most eight seconds, there is a dark ground
@@ -67,6 +64,16 @@ setTimeout(show, 8000);}
 COOKIE = "shadowgraph"
 LARGEST_FRAME = 1 << 21  # bytes of a message: twice a stage document, so that one too large gets a sentence
 FRAMES_WAITING = 4  # of one connection: received messages that are held before they are read
+HTML = "text/html; charset=utf-8"
+SAFE_HEADERS = {  # of every answer of a server of ours
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+STAGE_HEADERS = SAFE_HEADERS | {  # a page of the same server may show the stage in a frame
+    "X-Frame-Options": "SAMEORIGIN",
+    "Cache-Control": "no-cache",
+}
 OWN_HEADERS = SAFE_HEADERS | {
     # nothing is loaded from elsewhere, and no other page may show this one in a frame (clickjacking)
     "Content-Security-Policy": (
@@ -100,18 +107,18 @@ def fault_of(raw: bytes | str) -> str:
 class GuardedServer(viser.ViserServer):
     """A ViserServer behind `is_own_page` and `fault_of`, without its banner and its public share tunnel."""
 
-    def __init__(self, host: str, port: int, stage: StageFiles | None = None, title: str = "Shadowgraph"):
+    def __init__(self, host: str, port: int, run_dir: Path | None = None, title: str = "Shadowgraph"):
         """Serve on this host and port, or on the next free port, see `get_port`.
 
         Args:
-            stage: served below STAGE, beside viser's page.
+            run_dir: a run whose stage is served below STAGE, beside viser's page.
             title: of the page.
 
         Raises:
             RuntimeError: the guard does not fit this version of viser.
         """
         self.token = "" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)  # of the address; "": none needed
-        with _guarded_handshakes(host, self.token, stage, title) as guards, contextlib.redirect_stdout(io.StringIO()):
+        with _guarded_handshakes(host, self.token, run_dir, title) as guards, contextlib.redirect_stdout(io.StringIO()):
             super().__init__(host=host, port=port, verbose=False)
         if not guards:  # another viser, which opens its socket in another way
             self.stop()
@@ -220,35 +227,31 @@ def _is_stage_document(request: Request | None) -> bool:
     return request is not None and request.path.partition("?")[0] == STAGE_DOCUMENT
 
 
-async def _stage_answer(connection: ServerConnection, request: Request, stage: StageFiles | None) -> Response | None:
+async def _stage_answer(connection: ServerConnection, request: Request, run_dir: Path | None) -> Response | None:
     """Answer a request below STAGE; None where it opens the socket that takes the document."""
-    if stage is not None and _is_websocket(request.headers) and _is_stage_document(request):
+    if run_dir is not None and _is_websocket(request.headers) and _is_stage_document(request):
         return None
-    found, sentence = None, "There is no such file here.\n"
+    status, text = http.HTTPStatus.NOT_FOUND, "There is no such file here.\n"
     try:
-        name = request.path.partition("?")[0].removeprefix(STAGE)
-        if stage is not None:
-            packing = asyncio.create_task(asyncio.to_thread(stage.get, name))
-            found = await asyncio.wait_for(asyncio.shield(packing), PACKING_S)
-    except TimeoutError:  # a handshake may not wait longer; a browser asks again by itself
-        found = PACKING, HTML
+        if run_dir is not None and request.path.partition("?")[0] == STAGE:
+            text = page_of(run_dir, await asyncio.to_thread(stage_pack, run_dir), "socket", "/")
+            status = http.HTTPStatus.OK
     except UserError as error:
-        sentence = f"{error}\n"
-    answer = connection.respond(http.HTTPStatus.OK if found else http.HTTPStatus.NOT_FOUND, "" if found else sentence)
-    if found is not None:
-        del answer.headers["Content-Type"], answer.headers["Content-Length"]
-        answer.headers["Content-Type"], answer.headers["Content-Length"] = found[1], str(len(found[0]))
-        answer.body = found[0]
-    answer.headers.update(HEADERS)
+        text = f"{error}\n"
+    answer = connection.respond(status, text)
+    if status is http.HTTPStatus.OK:
+        del answer.headers["Content-Type"]
+        answer.headers["Content-Type"] = HTML
+    answer.headers.update(STAGE_HEADERS)
     return answer
 
 
-async def _keep_document(connection: ServerConnection, stage: StageFiles) -> None:
+async def _keep_document(connection: ServerConnection, run_dir: Path) -> None:
     """Keep each document that comes, and answer with nothing, or with the sentence why it was not kept."""
     async for message in connection:
         content = message.encode() if isinstance(message, str) else bytes(message)
         try:
-            await asyncio.to_thread(save_stage_document, stage.run_dir, content)
+            await asyncio.to_thread(save_stage_document, run_dir, content)
             await connection.send("")
         except UserError as error:
             await connection.send(str(error))
@@ -269,7 +272,7 @@ class _GuardedConnection(ServerConnection):
 
 @contextlib.contextmanager
 def _guarded_handshakes(
-    bound_host: str, token: str, stage: StageFiles | None, title: str
+    bound_host: str, token: str, run_dir: Path | None, title: str
 ) -> Iterator[list[Callable[..., Any]]]:
     """Open each websockets server with `_refusal` before its request handler while the block runs.
 
@@ -281,7 +284,7 @@ def _guarded_handshakes(
         async def guard(connection: ServerConnection, request: Request) -> Response | None:
             answer = _refusal(connection, request, bound_host, token)
             if answer is None and request.path.startswith(STAGE):
-                return await _stage_answer(connection, request, stage)
+                return await _stage_answer(connection, request, run_dir)
             answer = answer or process_request(connection, request)
             if answer is not None:
                 _name_page(answer, title)
@@ -289,8 +292,8 @@ def _guarded_handshakes(
             return answer
 
         async def handle(connection: ServerConnection) -> None:
-            if stage is not None and _is_stage_document(connection.request):
-                await _keep_document(connection, stage)
+            if run_dir is not None and _is_stage_document(connection.request):
+                await _keep_document(connection, run_dir)
             else:
                 await handler(connection)
 

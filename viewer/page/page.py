@@ -8,7 +8,6 @@ import math
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import viser
@@ -16,10 +15,9 @@ import viser
 from calibration.calibrated_views import CalibratedView, load_views
 from calibration.calibration import Calibration
 from capture.errors import UserError
-from reconstruct.run_folder.folder import LOG
 from reconstruct.stored_run.maps import THUMBS
 from reconstruct.stored_run.ply import read_preview
-from reconstruct.stored_run.stored_run import CALIBRATION, MESH
+from reconstruct.stored_run.stored_run import CALIBRATION
 from viewer.display.layers import (
     FIRST_FOV,
     Host,
@@ -33,14 +31,13 @@ from viewer.display.layers import (
     draw_light,
     draw_mesh,
     first_view,
-    framed_view,
     light_position,
     light_room,
-    page_mesh,
     page_scale,
 )
-from viewer.display.run_follower import HULL, RunFollower, loss_curves, size_text, status
+from viewer.display.run_follower import HULL, PREVIEW, RunFollower, status
 from viewer.page.controls import Controls
+from viewer.stage.page import is_finished
 
 MIN_INTERVAL_S = 2.0  # as often as a run writes its growing mesh, and as a visitor can follow
 COST_FACTOR = 25.0  # times what the last sending cost: at most a 25th of one processor, 4 % of a run that uses one
@@ -60,7 +57,7 @@ class Page:
         self.is_over = False
         self.controls = Controls(host, run_dir, self._show_layers, self.choose_photo)
         self.problem = ""  # a sentence about a damaged file of this run
-        self._sent, self._cpu_s = -math.inf, 0.0  # clock and CPU seconds when surface and curves were sent last
+        self._sent, self._cpu_s = -math.inf, 0.0  # clock and CPU seconds when the surface was sent last
         self._cost_s: float | None = 0.0  # CPU seconds that it took; None: not asked since
         self._lock = threading.RLock()
         self._calibration: Calibration | None = None
@@ -71,8 +68,7 @@ class Page:
         self._mesh: viser.GlbHandle | viser.MeshHandle | None = None
         self._hull: viser.MeshHandle | None = None
         self._lamp: LampMarker | None = None
-        self._size = self._mesh_name = ""
-        self._is_framed = self._awaits_thumbnail = False
+        self._awaits_thumbnail = False
         host.scene.set_up_direction("+z")
         host.scene.configure_environment_map(None)
         light_room(host, has_lamp=False)
@@ -86,7 +82,7 @@ class Page:
             self.refresh()
 
     def _is_due(self) -> bool:
-        """Return whether surface and curves, which cost much, may be sent: a run beside this keeps the processor.
+        """Return whether the surface, which costs much, may be sent: a run beside this keeps the processor.
 
         The cost of a sending is the CPU time of the whole process until this is asked: other threads do it.
         """
@@ -94,39 +90,28 @@ class Page:
             self._cost_s = time.process_time() - self._cpu_s
         return time.monotonic() - self._sent >= max(MIN_INTERVAL_S, COST_FACTOR * self._cost_s)
 
-    def _begin_sending(self) -> None:
-        if self._cost_s is not None:  # else what goes with this is being sent already
-            self._sent, self._cpu_s, self._cost_s = time.monotonic(), time.process_time(), None
-
     def refresh(self) -> None:
         """Read the folder once and show what is new."""
         with self._lock:
             lines = self.follower.log()
             now = status(lines, self.follower.is_running(), self.follower.since_last_line_s())
-            self.is_over, is_due = now.is_over, now.is_over or self._is_due()
+            self.is_over = now.is_over
             try:
-                self._read_results(lines, is_due)
+                self._read_results()
             except UserError as error:  # a damaged file: the page shows this and goes on
                 self.problem = str(error)
             if self._awaits_thumbnail:
                 self._show_photo(self.controls.photo_index())
             elif self._calibration is None and self.follower.changed(THUMBS):
                 self._show_read_photo()
-            has_result = now.is_over and self._mesh_name == MESH and self.follower.has_result(lines)
-            self.controls.follow(now, lines, self.problem or self._size, has_result)
-            if is_due and self.follower.changed(LOG):
-                seconds, losses = loss_curves(lines)
-                if len(seconds) > 1:
-                    self._begin_sending()
-                    self.controls.show_losses(seconds, losses)
+            self.controls.follow(now, lines, self.problem, now.is_finished and is_finished(self.follower.path))
 
-    def _read_results(self, lines: list[dict[str, Any]], is_due: bool) -> None:
+    def _read_results(self) -> None:
         if self.follower.changed(CALIBRATION):
             self._show_calibration()
-        name = self.follower.mesh_name(lines)
-        if is_due and name and self._calibration and (self.follower.changed(name) or name != self._mesh_name):
-            self._begin_sending()
-            self._show_mesh(name, self._calibration)
+        if self._calibration and (self.is_over or self._is_due()) and self.follower.changed(PREVIEW):
+            self._sent, self._cpu_s, self._cost_s = time.monotonic(), time.process_time(), None
+            self._show_mesh(self._calibration)
         if self._calibration and self.follower.changed(HULL):
             hull = read_preview(self.follower.path / HULL)
             if hull is not None:
@@ -161,26 +146,14 @@ class Page:
         if self._camera is not None:
             self._camera.position, self._camera.look_at, self._camera.fov = place, target, FIRST_FOV
 
-    def _show_mesh(self, name: str, calibration: Calibration) -> None:
-        path = self.follower.path / name
-        if name == MESH:
-            stat = path.stat()
-            mesh = page_mesh(path, (stat.st_mtime_ns, stat.st_size))
-        else:
-            mesh = read_preview(path)
+    def _show_mesh(self, calibration: Calibration) -> None:
+        mesh = read_preview(self.follower.path / PREVIEW)
         if mesh is None:
             return
-        self._mesh_name = name
         self._mesh = draw_mesh(self.host, mesh, self._scale, self.controls.shows("Surface"))
-        bounds = np.stack([mesh.vertices.min(0), mesh.vertices.max(0)])
-        self._size = size_text(bounds[1] - bounds[0], calibration.unit) if name == MESH else ""
         if self._lamp is None:
             self._lamp = draw_lamp(self.host, np.zeros(3), self._scale.factor * calibration.ground_height)
             self._move_lamp(self.controls.photo_index())
-        if name == MESH and not self._is_framed:  # once: then a visitor may have turned it
-            self._is_framed = True
-            if self._camera is not None:
-                self._look(*framed_view(bounds, calibration, self._scale, self._camera.aspect))
         self._show_layers()
 
     # --- what the controls do ----------------------------------------------------------------------------------------

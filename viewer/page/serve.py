@@ -4,6 +4,7 @@ Each browser window has a page of its own, so that nobody's lamp, layers or view
 itself (pause, stop) are files of the run folder: they are seen by all.
 """
 
+import contextlib
 import gc
 import socket
 import threading
@@ -13,14 +14,14 @@ from pathlib import Path
 
 import viser
 
+from capture.errors import UserError
 from capture.files.title import title_of
 from reconstruct.run.bundle import user_name
 from reconstruct.run_folder.forecast import give_memory_back, share_memory_among_threads
 from reconstruct.stored_run.documents import refuse_no_run
 from viewer.page.guard import GuardedServer, is_loopback
 from viewer.page.page import Page
-from viewer.stage.files import StageFiles
-from viewer.stage.page import is_finished
+from viewer.stage.page import is_finished, stage_pack
 
 POLL_S = 0.5  # between two looks at the folder: the growing mesh is written every two seconds
 GIVE_BACK_S = 60.0  # takes a twentieth of a second
@@ -71,16 +72,17 @@ def view(
     Raises:
         UserError: it is not the folder of a run.
     """
-    refuse_no_run(Path(run_dir))
+    refuse_no_run(run_dir)
     share_memory_among_threads()
-    stage = StageFiles(Path(run_dir))
-    server = GuardedServer(host, port, stage, f"{title_of(Path(run_dir))} - Shadowgraph")
-    visitors = Visitors(Path(run_dir), server)
+    if is_finished(run_dir):
+        with contextlib.suppress(UserError):  # the visitor gets the sentence
+            stage_pack(run_dir)  # before somebody waits for it
+    server = GuardedServer(host, port, run_dir, f"{title_of(run_dir)} - Shadowgraph")
+    visitors = Visitors(run_dir, server)
     gc.freeze()  # objects made by imports stay; without this each collection would scan them for 0.15 s
-    start = "stage/" if is_finished(Path(run_dir)) else ""
+    start = "stage/" if is_finished(run_dir) else ""
     for line in address_lines(host, server.get_port(), server.token, start):
         say(line)
-    threading.Thread(target=stage.warm, daemon=True).start()
     if opens is not None:
         opens(f"http://localhost:{server.get_port()}/{start}" + (f"?token={server.token}" if server.token else ""))
     given_back = time.monotonic()

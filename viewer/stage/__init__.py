@@ -1,7 +1,7 @@
 """The stage: a finished run as a picture that is lit from where the pointer is, and turned in the hand.
 
 Comes in: the folder of a finished run.
-Goes out: a page in one file, to send (`page_of`), and the same beside viser's page (`StageFiles`).
+Goes out: a page in one file, to send (`page_of`), and the same beside viser's page (viewer/page).
 
 One idea: what the browser draws is always the same mesh with the same materials, light and shadow. The first view is
 the photo's: each pixel takes its albedo from the photo's own pixel, by projection, so that the page opens as a relit

@@ -7,6 +7,7 @@ import html
 import json
 import re
 from dataclasses import replace
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -49,23 +50,20 @@ def kept_pack(run_dir: Path) -> StagePack | None:
         raise ReconstructionError(f"{run_dir} cannot be read ({error.strerror or error}).") from error
 
 
-def stage_pack(run_dir: Path, made: StagePack | None = None) -> StagePack:
+def stage_pack(run_dir: Path) -> StagePack:
     """Return the packed stage of a run, made in memory where the run keeps none.
-
-    Args:
-        made: one that was made before, which is returned if it is of the run's results as they are now.
 
     Raises:
         UserError: the run is not finished, or a file of it cannot be used.
     """
-    pack = kept_pack(run_dir)
-    if pack is None and made is not None and made.facts["madeOf"] == marks_of(run_dir):
-        return made
-    if pack is None:
-        from viewer.stage.parts import packed_stage  # torch takes seconds to import; a packed stage needs none of it
+    return kept_pack(run_dir) or _packed(run_dir, str(marks_of(run_dir)))
 
-        pack = StagePack(packed_stage(StoredRun(run_dir)))
-    return pack
+
+@lru_cache(maxsize=1)
+def _packed(run_dir: Path, _made_of: str) -> StagePack:
+    from viewer.stage.parts import packed_stage  # torch takes seconds to import; a packed stage needs none of it
+
+    return StagePack(packed_stage(StoredRun(run_dir)))
 
 
 def write_stage(run_dir: Path) -> None:
@@ -107,36 +105,30 @@ def page_html(
 
     Args:
         document: notes and views, None: none yet.
-        saves: how its document can be kept with the run: "socket" (WebSocket stage.json of its server, which also makes
-            other kinds of files), "frame" (a message to the page around it, as this one has no origin); "": it cannot.
+        saves: how its document can be kept with the run: "socket" (WebSocket stage.json of its server), "frame" (a
+            message to the page around it, as this one has no origin); "": it cannot.
         home: address of the page that led here, for a link back; "": none.
-        fault: the verdict on a result that is not good; in a "frame" the page around it says it.
+        fault: the verdict on a result that is not good; in a "frame" the page around it says this, title and size.
     """
-    is_served = saves == "socket"
     kinds = {part: "image/jpeg" if part.endswith(".jpg") else "application/octet-stream" for part in pack.names}
     facts = addressed(pack.facts, {part: as_address(pack.read(part), kind) for part, kind in kinds.items()})
     values = {
         "title": html.escape(name),
         "size": html.escape(str(facts["size"])),
-        "fault": html.escape(fault) if saves != "frame" else "",
-        "policy": page_policy("'self'" if is_served else "'none'"),
+        "header": "hidden" if saves == "frame" else "",
+        "fault": html.escape(fault),
+        "policy": page_policy("'self'" if saves == "socket" else "'none'"),
         "style": _asset("stage.css"),
         "first": html.escape(facts["addresses"]["first"]),
         "scene": _json({**facts, "name": name}),
         "document": _json(document or EMPTY),
-        "served": _json({"saves": saves, "home": home, **({"formats": _file_kinds()} if is_served else {})}),
+        "served": _json({"saves": saves, "home": home}),
         "shaders": "\n".join(
             f'<script type="text/plain" id="{shader}">{_asset(f"{shader}.glsl")}</script>' for shader in SHADERS
         ).replace("//#photo", _asset("photo.glsl")),
         "script": script_text(),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda found: values[found.group(1)], _asset("stage.html"))
-
-
-def _file_kinds() -> dict[str, tuple[str, str]]:
-    """Return title and suffix of each format that a served page offers: videos take minutes and are the command's."""
-    rows = FORMATS.items()
-    return {name: (row.title, row.suffix) for name, row in rows if "frames" not in row.takes and name != "html"}
 
 
 def page_policy(connects: str = "'none'") -> str:

@@ -9,7 +9,6 @@ The 3D pages of runs (`shadowgraph view`), too, are each a process of its own, w
 
 import inspect
 import json
-import math
 import re
 import subprocess
 import sys
@@ -166,11 +165,11 @@ class Helper:
 class Newest:
     """The newest answers of one kind of task, by what each is about: asked for anew once that has changed."""
 
-    def __init__(self, helper: Helper, task: str, pause_s: float = 0.0):
-        """Ask nothing yet; `pause_s` is between two answers about the same."""
-        self._helper, self._task, self._pause_s = helper, task, pause_s
+    def __init__(self, helper: Helper, task: str):
+        """Ask nothing yet."""
+        self._helper, self._task = helper, task
         self._pending: dict[Any, tuple[Task, str]] = {}
-        self._answers: dict[Any, tuple[Any, str, float]] = {}  # and the mark that it is of, and when by our clock
+        self._answers: dict[Any, tuple[Any, str]] = {}  # and the mark that it is of
 
     def about(self, key: Any, mark: str, **arguments: Any) -> Any:
         """Return the newest answer, None where there is none yet, and ask for one of this mark. The caller comes again.
@@ -178,15 +177,14 @@ class Newest:
         Args:
             mark: changes with the answer; "": there is nothing to ask for.
         """
-        answer, before, when = self._answers.get(key, (None, "", -math.inf))
+        answer, before = self._answers.get(key, (None, ""))
         task, asked = self._pending.get(key, (None, ""))
         if task is not None and task.done():
             self._pending.pop(key, None)  # another request may have been here
             if task.exception() is None:
-                answer, before = task.result(), asked
-            when = time.monotonic()
-            self._answers[key], task = (answer, before, when), None
-        if task is None and mark not in ("", before) and time.monotonic() - when >= self._pause_s:
+                answer, before = self._answers[key] = task.result(), asked
+            task = None
+        if task is None and mark not in ("", before):
             self._pending[key] = self._helper.ask(self._task, is_urgent=True, **arguments), mark
         return answer
 

@@ -23,9 +23,8 @@ from capture.session.sorting import clips_of, folder_role, photos_of
 from reconstruct.run.queue import FAILED, FINISHED, RUNNING, STOPPED, WAITING, Job, Queue
 from reconstruct.run_folder.folder import LOG
 from reconstruct.stored_run.documents import CHECK, REPORT, read_check, read_manifest, read_report
-from reconstruct.stored_run.maps import THUMBS
 from reconstruct.stored_run.stage_pack import FORMAT, opened_pack
-from viewer.display.run_follower import PREVIEW, RunFollower, Status, size_text, status
+from viewer.display.run_follower import RunFollower, Status, size_text, status
 from viewer.stage.page import page_html
 from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder, mark_of, without_folder
@@ -136,7 +135,6 @@ class Library:
             "size": size_text(np.array(extents, float), str(report.get("unit", "mm"))) if extents else "",
             "scale": str(report.get("scale", "")),
             "guessed": ((mesh.get("evidence") or {}).get("unconstrained") or {}).get("share"),
-            "growing": growing_mark(path) if state == RUNNING else "",
             "warnings": report.get("warnings", [])[:20],
             "date": changed,
             "has_report": is_regular(path / "report.html"),
@@ -176,11 +174,6 @@ class Library:
         if job is not None:
             return Path(job.task.capture) == capture
         return run.name.startswith(capture.name) and OF_CAPTURE.fullmatch(run.name[len(capture.name) :]) is not None
-
-
-def growing_mark(run: Path) -> str:
-    """Return a text that changes with what a picture of a run under way shows; "" where there is nothing to show."""
-    return mark_of(run / PREVIEW) or mark_of(run / THUMBS)
 
 
 @lru_cache(MOST_DOCUMENTS)

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from dataclasses import asdict
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +27,12 @@ from viewer.stage.page import kept_pack
 from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder, Trash, mark_of
 from viewer.studio.helper import Helper, LivePages, Newest
-from viewer.studio.library import EXAMPLE, Library, example_photos, growing_mark
+from viewer.studio.library import EXAMPLE, Library, example_photos
 from viewer.studio.saving import Saving
 
 TICK_S = 0.5
 LEAVING_S = 5.0  # that a step may take to its end when the studio closes; files that are cut off go on the next time
 PICTURE_PX = 320
-GROWING_PAUSE_S = 4.0  # between two pictures of a run under way: each takes some tenths of a CPU second
 USUAL = (36, 4032, 3024)  # photos, and their px, where none are there yet: a phone's
 PRESETS = ("draft", "standard", "fine")
 REPORT_PAGE = "report.html"
@@ -60,7 +58,6 @@ class Studio:
         self.library = Library(folder, self.queue, self.parts, self.checks)
         self.trash = Trash(folder.root)
         self.pages = LivePages(folder)
-        self._growing = Newest(self.thumbnails, "growing", GROWING_PAUSE_S)
         self.saving = Saving(folder)
         self._lock, self._ended = threading.RLock(), threading.Event()
         self._presets = Newest(self.pictures, "presets")
@@ -151,13 +148,6 @@ class Studio:
         """Return the small picture of a finished run, which its stage begins with, or the task that packs the stage."""
         pack = self.stage(key)
         return pack if isinstance(pack, Future) else pack.read(pack.facts["addresses"]["first"])
-
-    def growing_picture(self, key: str) -> Path | None:
-        """Return the newest picture of a run under way, and ask for the next one; None where there is none yet."""
-        run = self.folder.run(key)
-        out = self.folder.kept / "pictures" / f"growing-{sha256(key.encode()).hexdigest()[:24]}.jpg"
-        is_made = self._growing.about(run, growing_mark(run), run=str(run), out=str(out))
-        return out if is_made and is_regular(out) else None
 
     def stage(self, key: str) -> "StagePack | Future[Any]":
         """Return the packed stage of a finished run, or the task that packs it where the run has not done so."""

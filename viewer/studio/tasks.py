@@ -6,7 +6,6 @@ Nothing of this is imported by the server. `python -m viewer.studio.tasks` answe
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
-from math import ceil, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +16,10 @@ from capture.decode.formats import read_exif
 from capture.files.atomic import atomic_file
 from capture.photos.photo import JPEG_QUALITY, read_thumbnail
 from reconstruct.check.coach import Coach
-from reconstruct.stored_run.maps import read_thumbnails
-from reconstruct.stored_run.ply import Triangles, read_preview
-from reconstruct.stored_run.stored_run import CALIBRATION
-from viewer.display.run_follower import PREVIEW, RunFollower
 from viewer.studio.helper import answer_lines
 
 ORIENTATION = ExifTags.Base.Orientation
 MOST_LOOKS = 4  # captures whose small photos stay in memory
-MOST_SHOWN = 64  # photos of a run on one sheet
-GROWING_PX = (640, 480)  # of a run under way
-DARK, GAP = (24, 26, 31), 4  # behind it, and px between photos
 _looks: dict[str, Coach] = {}
 
 
@@ -55,42 +47,6 @@ def presets(photos: int, width: int, height: int) -> list[dict[str, Any]]:
     from reconstruct.run.machine import predicted_runs
 
     return predicted_runs(photos, width, height)
-
-
-def growing(run: str, out: str) -> bool:
-    """Write a picture of a run under way: the surface as it is now, or the photos that it has read; say so."""
-    folder = Path(run)
-    surface = read_preview(folder / PREVIEW)
-    picture = _contact_sheet(folder) if surface is None else _surface_picture(folder, surface)
-    _save(picture, Path(out))
-    return True
-
-
-def _contact_sheet(run: Path) -> Image.Image:
-    """Return the small photos of a run side by side, in the order of their names."""
-    photos = read_thumbnails(run, RunFollower(run).thumbnails()[:MOST_SHOWN])
-    columns = max(1, ceil(sqrt(len(photos))))
-    width, height = GROWING_PX[0] // columns, GROWING_PX[1] // columns
-    sheet = Image.new("RGB", GROWING_PX, DARK)
-    for number, photo in enumerate(photos.values()):
-        small = ImageOps.pad(Image.fromarray(photo), (width - GAP, height - GAP), color=DARK)
-        sheet.paste(small, (number % columns * width, number // columns * height))
-    return sheet
-
-
-def _surface_picture(run: Path, surface: Triangles) -> Image.Image:
-    """Return the growing surface from the camera's side."""
-    import trimesh
-
-    from calibration.calibration import load_calibration
-    from viewer.report.document import mesh_picture
-    from viewer.report.pictures import view_from_camera
-
-    mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=surface.colours, process=False)
-    way = view_from_camera(mesh, load_calibration(run / CALIBRATION))
-    picture = Image.fromarray(mesh_picture(mesh, way, GROWING_PX))
-    behind = Image.new("RGBA", GROWING_PX, (*DARK, 255))
-    return Image.alpha_composite(behind, picture)
 
 
 def save(
@@ -131,7 +87,7 @@ def _save(picture: Image.Image, out: Path) -> None:
         picture.convert("RGB").save(temporary, "JPEG", quality=JPEG_QUALITY)
 
 
-TASKS = {task.__name__: task for task in (thumbnail, look, presets, growing, save, pack, report)}
+TASKS = {task.__name__: task for task in (thumbnail, look, presets, save, pack, report)}
 
 if __name__ == "__main__":
     answer_lines(TASKS)

@@ -24,8 +24,7 @@ from websockets.datastructures import Headers
 from capture.errors import UserError
 from capture.files.atomic import parse_json
 from capture.files.names import in_one_line
-from viewer.page.guard import COOKIE, is_own_page, is_same
-from viewer.stage.files import SAFE_HEADERS
+from viewer.page.guard import COOKIE, SAFE_HEADERS, is_own_page, is_same
 from viewer.studio.folder import without_folder
 from viewer.studio.helper import in_page_words
 

@@ -16,9 +16,9 @@ from starlette.routing import Route
 from calibration.board.board import parse_print
 from calibration.board.printing import DEFAULT_BOARDS, PAPERS, BoardPage, draw_pdf, lay_out
 from capture.errors import CaptureError
-from capture.files.regular import is_regular, read_regular
+from capture.files.regular import is_regular
 from reconstruct.stored_run.stage_document import save_stage_document
-from viewer.stage.files import HEADERS, HTML
+from viewer.page.guard import HTML, STAGE_HEADERS
 from viewer.stage.page import page_of, page_policy
 from viewer.studio.library import example_page
 from viewer.studio.studio import Studio
@@ -35,8 +35,7 @@ BOARDS = (  # text of session.toml ("": none), title, about
     ("card", "A bank card", "No printer needed: for objects not much larger than a hand."),
 )
 SAVED = ("format", "size")  # what a request for another kind of file names beside the run
-LARGEST_PICTURE = 1 << 22  # bytes of a run under way: ours have 100 kB
-STAGED = HEADERS | {  # of a page that runs the stage's script, and saves pictures and notes
+STAGED = STAGE_HEADERS | {  # of a page that runs the stage's script, and saves pictures and notes
     "Content-Security-Policy": f"sandbox allow-scripts allow-downloads allow-forms; {page_policy()}; "
     "frame-ancestors 'self'"
 }
@@ -75,7 +74,6 @@ def _questions(studio: Studio, phones: Phones) -> list[Route]:
         ask("/api/code", lambda r: Response(phones.code("live" in r.query_params), media_type="image/svg+xml")),
         ask("/api/picture", lambda r: _made(studio.picture(_key(r), r.query_params.get("photo", "")), "image/jpeg")),
         ask("/api/run_picture", lambda r: _made(studio.run_picture(_key(r)), "image/jpeg")),
-        ask("/api/growing", lambda r: _growing(studio.growing_picture(_key(r)))),
         ask("/api/formats", lambda _: studio.saving.formats()),
         ask("/api/saved", lambda r: studio.saving.asked(_key(r))),
         ask("/download", lambda r: _download(studio.saving.file(_key(r), *(r.query_params.get(n, "") for n in SAVED)))),
@@ -172,14 +170,6 @@ def _made(found: "Path | bytes | Future[Any]", kind: str) -> Response:
     if found.done():
         found.result()  # or its error
     return JSONResponse({"wait": True}, 202)
-
-
-def _growing(found: Path | None) -> Response:
-    """Return the newest picture of a run under way; the page asks again for the next one."""
-    if found is None:
-        return JSONResponse({"wait": True}, 202)
-    content = read_regular(found, LARGEST_PICTURE)  # at once: the file is replaced by the next picture at any moment
-    return Response(content, media_type="image/jpeg")
 
 
 def _download(file: Path) -> Response:

@@ -27,10 +27,6 @@ export function useHands(middle, whenMoved) {
   canvas.addEventListener("wheel", (e) => { e.preventDefault(); moved(e.timeStamp); zoomView(e.deltaY > 0 ? 1 / ZOOM_PER_NOTCH : ZOOM_PER_NOTCH, inSides(e.clientX, e.clientY)); }, { passive: false });
   canvas.addEventListener("dblclick", () => { if (!tool.kind) goHome(); });
   window.addEventListener("keydown", key);
-  // Keys that the page around this one got, as long as one of its buttons has the focus.
-  window.addEventListener("message", ({ source, data }) => {
-    if (source === parent && parent !== window && data.press) canvas.dispatchEvent(new KeyboardEvent("keydown", { ...data.press, bubbles: true, cancelable: true }));
-  });
 }
 
 function down(e) {

@@ -12,16 +12,15 @@ import { isNarrow, openPanel, panelMoved, showLamp, showSaved, showShown, showSt
 
 const SETTLED_MS = 250;
 const ROOMY = 1100;                  // px of a window in which the panel is open at first
-const EDGE = 20;                     // px
 const LAMP_SAID_MS = 200;
 let pointerAt = 0, settling = 0, lampWaits = 0;
 
-// The part of the window that nothing lies over: above and below by what stands there, on the right by an open panel.
+// The part of the window that nothing lies over: below title and buttons, above buttons and legend, beside or above an open panel.
 function freePart() {
-  const panel = byId("panel"), isOpen = !panel.hidden, box = panel.getBoundingClientRect(), [header, modes] = ["header", "#modes"].map((name) => document.querySelector(name).getBoundingClientRect());
-  const legend = byId("legend").hidden ? innerHeight : byId("legend").getBoundingClientRect().top;
-  const top = isNarrow() ? header.bottom : EDGE, bottom = !isNarrow() ? innerHeight - EDGE : Math.min(isOpen ? box.top : modes.top || innerHeight, legend);
-  const width = isOpen && !isNarrow() ? box.left : innerWidth;
+  const [header, tools, modes, legend, panel] = ["header", "#tools", "#modes", "#legend", "#panel"].map((name) => document.querySelector(name).getBoundingClientRect());
+  const tops = [modes, legend, isNarrow() ? panel : {}].filter((box) => box.height).map((box) => box.top);  // what is hidden has no height
+  const top = Math.max(header.bottom, tools.bottom), bottom = Math.min(innerHeight, ...tops);
+  const width = panel.height && !isNarrow() ? panel.left : innerWidth;
   return bottom - top < innerHeight / 4 ? { left: 0, top: 0, width, height: innerHeight } : { left: 0, top, width, height: bottom - top };
 }
 

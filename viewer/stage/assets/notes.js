@@ -1,6 +1,6 @@
 // Notes on the surface: arrows with a text and lengths with their uncertainty; saved views; copies of page and picture.
 import { add, norm } from "./vectors.js";
-import { byId, facts, served } from "./scene.js";
+import { byId, facts } from "./scene.js";
 import { editStage, lamp, onScreen, setLamp, setShown, setView, shown, stage, view } from "./state.js";
 import { camerasThatShow, pick, pointingSigma } from "./pick.js";
 
@@ -109,18 +109,6 @@ export function sharePage() {
   copy.querySelector("#served").textContent = JSON.stringify({ saves: "", home: "" });
   copy.querySelector("#document").textContent = JSON.stringify(stage).replaceAll("<", "\\u003c");
   download(`${facts.name}.html`, new Blob([`<!doctype html>\n${copy.outerHTML}`], { type: "text/html" }));
-}
-
-// The result as another kind of file, which the server makes; until it is there, a page comes that says so.
-export async function saveFile(kind) {
-  const [title, suffix] = served.formats[kind];
-  let answer = null;
-  say(`Being made: ${title} ...`);
-  do answer = await fetch(`save/${kind}`).catch(() => null); while (answer?.headers.get("Content-Type").startsWith("text/html"));
-  say(answer?.ok ? "" : answer ? await answer.text() : "The file could not be made: the server does not answer. Is it still running?");
-  if (!answer?.ok) return;
-  const file = await answer.blob();
-  download(`${facts.name}${file.type === "application/zip" ? ".zip" : suffix}`, file);
 }
 
 export async function savePicture(redraw) {

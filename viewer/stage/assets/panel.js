@@ -3,7 +3,7 @@ import { byId, facts, served } from "./scene.js";
 import {
   canRedo, canUndo, editStage, lamp, lampFromAbove, lampTo, putLamp, redo, savedSentence, setLamp, setShown, setView, shown, stage, undo,
 } from "./state.js";
-import { endTool, recallView, removeNote, removeView, saveFile, savePicture, saveView, sharePage, startTool, tool } from "./notes.js";
+import { endTool, recallView, removeNote, removeView, savePicture, saveView, sharePage, startTool, tool } from "./notes.js";
 import { showPhoto } from "./renderer.js";
 
 const RAKING = 8 * Math.PI / 180;
@@ -45,9 +45,6 @@ export function usePanel(redraw) {
   on("save-picture", "click", () => savePicture(redraw));
   on("share", "click", sharePage);
   on("list-keys", "click", listKeys);
-  for (const [kind, [title]] of Object.entries(served.formats || {})) byId("save-kind").append(new Option(title, kind));
-  byId("save-row").hidden = !served.formats;
-  on("save-file", "click", () => saveFile(byId("save-kind").value));
   on("menu", "click", () => openPanel(byId("panel").hidden));
   cropRows();
   showStage();

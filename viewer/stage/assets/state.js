@@ -6,7 +6,7 @@ export const LOOKS = ["photo", "specular", "unsharp", "curvature", "normals", "k
 export const LOW = 0.03, HIGH = 0.998;        // radius of the lamp's place in the dome seen from above
 // Elevation of the view, rad. Of an object that was laid anew the underside was photographed, too: it is seen from below.
 export const HIGHEST = 1.5, LOWEST = facts.isWhole ? -HIGHEST : 0.06;
-const FILLED = 0.88;                          // of the free part's sides, by the object
+const FILLED = 0.94;                          // of the free part's sides, by the object
 const MOST_UNDONE = 200;
 
 export const home = { ...facts.cameras[0].home, focal: 2.2, shift: [0, 0] };

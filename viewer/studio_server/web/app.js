@@ -3,9 +3,9 @@
 import { ask, h, morph, toast } from "./dom.js";
 import { home } from "./home.js";
 import { capture } from "./capture.js";
-import { compare, run } from "./result.js";
+import { run } from "./result.js";
 
-const VIEWS = { "": home, capture, run, compare };
+const VIEWS = { "": home, capture, run };
 const main = document.getElementById("main");
 let view = null, timer = 0, turn = 0, isLost = false;
 

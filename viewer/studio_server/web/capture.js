@@ -1,6 +1,6 @@
 // One capture: its board, its photos as they arrive, the verdict, and the start of a run.
 
-import { PRESETS, about, ask as question, attempt, bytes, change, changed, day, dialog, duration, failure, h, key, picture, plural, presetWords, rename, toast } from "./dom.js";
+import { PRESETS, about, ask as question, attempt, bytes, change, changed, day, dialog, duration, h, key, picture, plural, presetWords, rename, toast } from "./dom.js";
 import { boardOnScreen, printLink } from "./board.js";
 import { dome } from "./hemisphere.js";
 import { Sender, chooser, complaint, dropped, sending, unused } from "./upload.js";
@@ -124,7 +124,7 @@ export function capture(name, again) {
       row.photos.length + row.clips.length === 0 && h("p", { class: "quiet" }, "Photos first: 15 to 40 of the object, each with the light elsewhere."),
       isPending && h("p", { class: "quiet" }, check.is_running ? "Looking at all photos together." : "Waits until no more photos arrive."),
       check.sentence && h("p", { class: `verdict ${check.verdict}` }, check.sentence),
-      !check.sentence && check.error && failure(check.error),
+      !check.sentence && check.error && h("p", { class: "verdict bad" }, check.error),
       check.advice.length > 0 && h("div", {}, h("h3", {}, "Shoot next"), h("ul", { class: "plain" }, check.advice.map((text) => h("li", {}, text)))),
       check.reasons.length > 1 && h("details", {}, h("summary", {}, "Why"), h("ul", { class: "plain" }, check.reasons.map((text) => h("li", {}, text)))),
       row.coach.advice && (check.is_old || !check.sentence) && h("p", { class: "verdict" }, row.coach.advice),

@@ -139,13 +139,6 @@ export const rename = ({ key: place, title: before }, again) => attempt(async ()
   if (title) { await change("rename", { key: place, title }); again(); }
 });
 
-/** Why something failed: what is wrong, what to do, and the rest of a long text smaller. */
-export function failure(text) {
-  const [first, second, ...rest] = text.split(/(?<=[.:]) (?=[A-Z"])/);
-  return h("div", { class: "failure" }, h("p", { class: "verdict bad" }, first.slice(0, 1).toUpperCase() + first.slice(1)), second && h("p", {}, second),
-    rest.length > 0 && h("p", { class: "small quiet" }, rest.join(" ")));
-}
-
 export function bytes(count) {
   if (count >= 1e9) return `${(count / 1e9).toFixed(1)} GB`;
   return count >= 1e6 ? `${Math.round(count / 1e6)} MB` : `${Math.ceil(count / 1e3)} kB`;

@@ -9,7 +9,7 @@ const WORDS = {
 };
 
 export function home(_, again) {
-  let wanted = "", chosen = [];
+  let wanted = "";
   const view = { pause: 1500 };
 
   view.render = async (ask) => {
@@ -27,8 +27,7 @@ export function home(_, again) {
         isEmpty ? null : h("input", { type: "search", placeholder: "Search", "aria-label": "Search captures", value: wanted,
           oninput: (event) => { wanted = event.target.value.toLowerCase(); again(); } }),
         isEmpty ? null : h("button", { class: "main", onclick: fresh }, "New capture"),
-        isEmpty ? null : h("button", { onclick: () => choose(ask, again) }, "Add a folder"),
-        chosen.length === 2 && h("a", { class: "button", href: `#/compare/${chosen.map(key).join("|")}` }, "Compare the two")),
+        isEmpty ? null : h("button", { onclick: () => choose(ask, again) }, "Add a folder")),
       state.free < 2 * state.keep_free && h("p", { class: "warn" },
         `The disk has ${bytes(state.free)} free; runs need more. Empty the trash, or make room.`),
       queue(state.queue, again),
@@ -81,8 +80,6 @@ export function home(_, again) {
           (shown || run) && presetWords((shown || run).preset), day(card.date)].filter(Boolean).join(" · "))),
       h("div", { class: "foot" },
         shown && h("a", { class: "button small", href: `#/run/${key(shown.key)}` }, "Open"),
-        shown && h("button", { "aria-pressed": String(chosen.includes(shown.key)), onclick: () => mark(shown.key) },
-          chosen.includes(shown.key) ? "✓ Compare" : "Compare"),
         h("button", { "aria-label": `Rename ${card.title}`, onclick: () => rename(card, again) }, "Rename"),
         h("button", { class: "danger", "aria-label": `Delete ${card.title}`, onclick: () => remove(card) }, "Delete")));
   }
@@ -102,12 +99,6 @@ export function home(_, again) {
     if (state === "failed") return h("p", { class: "small bad" }, run.sentence);
     if (state === "waiting") return h("p", { class: "small" }, run.sentence);
     return judged.verdict_sentence ? h("p", { class: "small" }, judged.verdict_sentence) : null;
-  }
-
-  function mark(name) {
-    chosen = chosen.includes(name) ? chosen.filter((one) => one !== name) : [...chosen, name].slice(-2);
-    if (chosen.length === 1) toast("Choose a second one to compare it with.");
-    again();
   }
 
   const remove = (card) => attempt(async () => {

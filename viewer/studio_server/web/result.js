@@ -1,6 +1,6 @@
-// Runs: those that wait for this machine, the progress of one, its result once it is finished, two results side by side.
+// Runs: those that wait for this machine, the progress of one, its result once it is finished.
 
-import { about, ask, attempt, bytes, change, changed, dialog, duration, failure, h, key, plural, presetWords, rename } from "./dom.js";
+import { about, ask, attempt, bytes, change, changed, dialog, duration, h, key, plural, presetWords, rename } from "./dom.js";
 import { saving } from "./save.js";
 
 /** The seconds that jobs take together; null where that is not known. */
@@ -32,8 +32,7 @@ function cost(job) {
 
 export function run(name, again) {
   const view = { pause: 1000, wide: true };
-  let clock = 0, measured = 0;
-  const saver = saving(name, again), watched = growing(name);
+  const saver = saving(name, again);
 
   view.render = async (ask) => {
     const state = await ask("/api/state");
@@ -43,7 +42,6 @@ export function run(name, again) {
     const { card, one } = found;
     document.title = `${one.title} · Shadowgraph studio`;
     view.pause = one.state === "running" || one.state === "waiting" ? 1000 : 4000;
-    [clock, measured] = [one.progress.elapsed_s, Date.now()];
     return [
       h("h1", {}, one.title),
       one.state === "finished" ? result(one) : progress(one, before(state.queue, one), card.kind === "capture" ? `#/capture/${key(card.key)}` : ""),
@@ -69,12 +67,11 @@ export function run(name, again) {
       one.state === "running" && h("p", {}, `${percent} %, `, h("span", { id: "clock" }, duration(now.elapsed_s)), " so far",
         now.left_s ? `, about ${duration(now.left_s)} left` : ""),
       now.message && one.state === "running" && h("p", { class: "quiet" }, now.message),
-      one.state === "running" && watched(one),
-      one.sentence && (one.state === "failed" ? failure(one.sentence) : h("p", {}, one.sentence, one.state === "waiting" && begins)),
+      one.sentence && (one.state === "failed" ? h("p", { class: "verdict bad" }, one.sentence) : h("p", {}, one.sentence, one.state === "waiting" && begins)),
       one.state === "running" && h("p", { class: "quiet" }, "It goes on when this page or the studio is closed."),
       h("div", { class: "bar" },
         (one.state === "running" || one.state === "waiting") && one.job && h("button", { onclick: () => act(one, "stop") }, one.state === "running" ? "Stop and keep" : "Remove from the queue"),
-        one.growing && h("button", { onclick: () => inspect(one) }, "Watch it grow in 3D"),
+        one.state === "running" && h("button", { onclick: () => inspect(one) }, "Watch it grow in 3D"),
         one.state === "waiting" && h("button", { onclick: () => act(one, "first") }, "Next in line"),
         one.state === "failed" && photos && h("a", { class: "button main", href: photos }, "Look at its photos"),
         (one.state === "failed" || one.state === "stopped") && one.job && h("button", { class: one.state === "stopped" ? "main" : "", onclick: () => act(one, "again") }, "Go on where it stood")));
@@ -83,7 +80,7 @@ export function run(name, again) {
   function result(one) {
     return h("div", {},
       one.has_mesh ? stage(one) : h("p", { class: "bad" }, "This run has no result that could be shown: its mesh is missing. Start it again."),
-      h("div", { class: "bar" }, one.has_mesh && saver.share(), one.has_mesh && h("button", { onclick: fill }, "Fill the window"),
+      h("div", { class: "bar" }, one.has_mesh && h("button", { onclick: fill }, "Fill the window"),
         one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report")),
       facts(one),
       one.scale && h("p", { class: "quiet" }, one.scale),
@@ -107,23 +104,8 @@ export function run(name, again) {
     if (tab) { tab.opener = null; tab.location = address; } else location.href = address;
   });
 
-  const ticking = setInterval(() => {
-    const element = document.getElementById("clock");
-    if (element && measured) element.textContent = duration(clock + (Date.now() - measured) / 1000);
-  }, 250);
-  view.close = () => { clearInterval(ticking); saver.close(); };
+  view.close = saver.close;
   return view;
-}
-
-/** A picture of a run under way, asked for anew each time: the one before stays until the next is there. */
-function growing(name) {
-  const image = h("img", { class: "growing", key: "growing", hidden: true, alt: "What the run has so far: its photos, then the surface as it grows",
-    onload: () => { image.hidden = false; }, onerror: () => { image.hidden = true; } });
-  image.stays = true;
-  return (one) => {
-    if (one.growing) image.src = `/api/growing?key=${key(name)}&v=${Date.now()}`;
-    return image;
-  };
 }
 
 const facts = (one) => h("ul", { class: "facts" }, [one.size, one.preset && presetWords(one.preset), `made in ${duration(one.progress.elapsed_s)}`,
@@ -161,33 +143,3 @@ addEventListener("message", async ({ source, data }) => {
   } catch { kept = "the studio does not answer"; }
   source.postMessage({ kept }, "*");
 });
-
-const KEYS = /^(Arrow\w+|[-+=?lL0-9])$/; // of the stage
-
-/** While a button of this page has the focus, the stage's keys go to the results all the same. */
-addEventListener("keydown", (event) => {
-  const isBrowsers = event.altKey || event.metaKey || (event.ctrlKey && !event.key.startsWith("Arrow"));
-  const isTaken = event.defaultPrevented || isBrowsers || event.target.closest("input, select, textarea, dialog");
-  const frames = document.querySelectorAll("iframe.result");
-  if (isTaken || !frames.length || !KEYS.test(event.key)) return;
-  event.preventDefault();
-  if (event.key === "?") frames[0].focus(); // Escape then closes the list of keys
-  for (const one of frames) one.contentWindow.postMessage({ press: { key: event.key, shiftKey: event.shiftKey, ctrlKey: event.ctrlKey } }, "*");
-});
-
-export function compare(names) {
-  const view = { pause: 5000, wide: true };
-  view.render = async (ask) => {
-    const state = await ask("/api/state");
-    const runs = state.cards.flatMap((card) => card.runs);
-    const two = names.split("|").map(decodeURIComponent).map((name) => runs.find((one) => one.key === name));
-    if (two.length !== 2 || two.some((one) => !one || one.state !== "finished")) throw new Error("Two finished runs are needed to compare; one of these is not finished, or not here any more.");
-    document.title = `${two[0].title} and ${two[1].title} · Shadowgraph studio`;
-    return [
-      h("div", { class: "bar" }, h("h1", { class: "grow" }, `${two[0].title} and ${two[1].title}`), h("a", { class: "button", href: "#/" }, "All captures")),
-      h("div", { class: "pair" }, two.map((one) => h("div", { key: one.key }, h("h2", {}, one.title), stage(one),
-        facts(one)))),
-    ];
-  };
-  return view;
-}

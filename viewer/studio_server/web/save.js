@@ -1,14 +1,14 @@
 // A finished run as other kinds of files: for printing, for the web, for augmented reality, to send to somebody.
 
-import { about, ask, attempt, change, h, key, plural, toast } from "./dom.js";
+import { about, ask, attempt, change, h, key, plural } from "./dom.js";
 
 /** The panel of one run; `again` draws the page anew. */
 export function saving(name, again) {
-  let isShared = false, formats = null, chosen = "", size = "", files = [], timer = 0, isClosed = false;
+  let formats = null, chosen = "", size = "", files = [], timer = 0, isClosed = false;
   const begun = new Map(); // file -> when it was first seen under way, and which share was done then
 
   ask("/api/formats").then((rows) => {
-    formats = rows.filter((one) => one.name !== "html"); // the page is what Share makes
+    formats = rows.filter((one) => one.name !== "html"); // the page is what its own Share makes
     chosen = formats[0].name;
     refresh();
   }, () => {});
@@ -24,43 +24,12 @@ export function saving(name, again) {
     clearTimeout(timer);
     files = (await ask(`/api/saved?key=${key(name)}`).catch(() => files)).slice();
     if (isClosed) return;
-    if (isShared) handOver();
     if (files.some((one) => !one.file && !one.error)) timer = setTimeout(refresh, 1000);
     again();
   }
 
-  const page = () => files.find((one) => one.name === "html") || { name: "html", size: "" };
-
-  /** Make the page to send to somebody, and download it once it is there. */
-  const share = async () => {
-    isShared = true;
-    if (!await make(page())) isShared = false;
-    again();
-  };
-
-  function handOver() {
-    const made = page();
-    isShared = !made.file && !made.error;
-    if (made.error) toast(made.error, true);
-    if (!made.file) return;
-    const link = h("a", { download: made.file, href: addressOf(made) });
-    document.body.append(link);
-    link.click();
-    link.remove();
-    toast(`${made.file} is among your downloads. Send it: it opens in any browser.`);
-  }
-
-  function shareButton() {
-    const done = page().share;
-    return h("button", { class: "main", key: "share", disabled: isShared, title: "One file to send to somebody: the light follows the pointer", onclick: share },
-      isShared ? `Making the page${done ? `, ${Math.round(100 * done)} %` : ""}` : "Share");
-  }
-
   const addressOf = (one) => `/download?key=${key(name)}&format=${key(one.name)}&size=${key(one.size)}`;
-  const make = (one) => attempt(async () => {
-    try { await change("save", wish(one)); } finally { refresh(); }
-    return true;
-  });
+  const make = (one) => attempt(async () => { try { await change("save", wish(one)); } finally { refresh(); } });
   const forget = (one) => attempt(async () => { await change("forget_save", wish(one)); refresh(); });
 
   function row(one) {
@@ -98,5 +67,5 @@ export function saving(name, again) {
       h("ul", { class: "plain files" }, [...files].reverse().map(row)),
       h("p", { class: "hidden", role: "status" }, files.length ? `${plural(files.filter((one) => one.file).length, "file")} to download, ${files.filter((one) => !one.file && !one.error).length} being made` : ""));
   }
-  return { panel, share: shareButton, close: () => { isClosed = true; clearTimeout(timer); } };
+  return { panel, close: () => { isClosed = true; clearTimeout(timer); } };
 }
