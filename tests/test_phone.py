@@ -20,7 +20,6 @@ from capture.errors import CalibrationError, CaptureError
 from capture.session.declared_objects import PhoneBack
 from capture.session.session import load_session, load_settings
 
-pytestmark = pytest.mark.usefixtures("few_starts")
 LENS = Camera(1000, 750, 740.0, 740.0, 507.0, 381.0, (-0.04, 0.03, 0.0, 0.0, 0.0))
 OFFSET = np.array([13.0, -6.0, 1.0])  # from the lens to the LED, in the lens's camera frame
 TILT = np.array([0.02, -0.015, 1.0])  # the beam in that frame: a degree beside the optical axis
