@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from calibration.flashlight import fit
 from reconstruct.run import presets
 from reconstruct.shading import joint_normals
 from reconstruct.source.source import LONG_SIDES
@@ -30,11 +31,12 @@ def brief_command(*words: object) -> list[str]:
 
 @contextmanager
 def brief_drafts() -> Iterator[None]:
-    """The preset draft with smaller pictures, on coarser grids and with fewer iterations of every kind."""
+    """The preset draft with smaller pictures, coarser grids, fewer iterations of every kind and one start of lights."""
     first, last = presets.DRAFT_LEVELS
     levels = replace(first, nodes=32, iterations=20), replace(last, nodes=48, iterations=20)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(presets, "DRAFT_LEVELS", levels)
         patch.setitem(LONG_SIDES, "draft", SIDE)
         patch.setattr(joint_normals, "STEPS", NORMAL_STEPS)
+        patch.setattr(fit, "START_BEAMS", fit.START_BEAMS[:1])
         yield

@@ -5,12 +5,11 @@ The terminal names options, and a process of the studio buttons; words that neit
 
 import pickle
 import re
-import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 from PIL import Image
+from small_example import SIZE, small_example
 
 import shadowgraph
 from capture.errors import FOR_STUDIO, CalibrationError, CaptureError, Remedy, UserError
@@ -19,7 +18,6 @@ from reconstruct.source.source import RunOptions, open_source
 from shadowgraph.command import OPTIONS, sentence_for
 from viewer.studio.helper import in_page_words
 
-SPOT = Path(__file__).parent.parent / "examples" / "spot"
 OPTION = re.compile(r"(?<![\w-])--[a-z]{3}|`shadowgraph ")
 
 
@@ -29,16 +27,13 @@ def no_board(folder: Path) -> None:
         Image.new("RGB", (640, 480), (90 + number, 90, 90)).save(folder / "photos" / f"{number}.jpg")
 
 
-def copy_photos(folder: Path) -> None:
-    for name, count in (("board", 1), ("photos", 6)):
-        (folder / name).mkdir(parents=True)
-        for path in sorted((SPOT / name).iterdir())[:count]:
-            shutil.copy(path, folder / name)
+def few_photos(folder: Path) -> None:
+    small_example(folder, slice(1), slice(6))
 
 
 def grey_board(folder: Path) -> None:
-    copy_photos(folder)
-    Image.fromarray(np.full((756, 1008, 3), 128, np.uint8)).save(folder / "board" / "IMG_0001.jpg")
+    few_photos(folder)
+    Image.new("RGB", SIZE, (128, 128, 128)).save(folder / "board" / "IMG_0001.jpg")
 
 
 def other_settings(out: Path) -> None:
@@ -51,10 +46,10 @@ def other_settings(out: Path) -> None:
         (Path.mkdir, None, [], ["no photos", "capture"], "no photos"),
         (no_board, None, [], ["room light", "--lights FILE"], '"board" below the picture'),
         (grey_board, None, [], ["IMG_0001.jpg", "board"], "board"),
-        (copy_photos, None, ["--input", "shadow"], ["--input"], None),
-        (copy_photos, None, ["--device", "cuda"], ["cuda", "cpu"], None),
-        (copy_photos, Path.touch, [], ["--out"], "tart another run"),
-        (copy_photos, other_settings, [], ["--force"], "tart another run"),
+        (few_photos, None, ["--input", "shadow"], ["--input"], None),
+        (few_photos, None, ["--device", "cuda"], ["cuda", "cpu"], None),
+        (few_photos, Path.touch, [], ["--out"], "tart another run"),
+        (few_photos, other_settings, [], ["--force"], "tart another run"),
     ],
 )
 def test_what_is_wrong_is_one_sentence_in_the_words_of_either_front_end(
@@ -76,7 +71,7 @@ def test_what_is_wrong_is_one_sentence_in_the_words_of_either_front_end(
 
 
 def test_a_board_that_there_is_not_is_refused_before_any_photo_is_read(tmp_path):
-    copy_photos(tmp_path)
+    few_photos(tmp_path)
     with pytest.raises(CalibrationError, match=r"'checkerbord' is no kind of board.*checkerboard:9x6:24\.25"):
         open_source(tmp_path, RunOptions(board="checkerbord:9x6:24"))
     (tmp_path / "session.toml").write_text('board = "charuco:5x7"')

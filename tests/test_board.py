@@ -290,8 +290,7 @@ def test_waves_that_no_photo_tells_of_are_as_large_as_those_of_sheets_usually_ar
 # --- a board that is printed -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", DEFAULT_BOARDS)
-@pytest.mark.parametrize("paper", PAPERS)
+@pytest.mark.parametrize(("kind", "paper"), list(zip(DEFAULT_BOARDS, PAPERS, strict=True)))
 def test_the_printed_board_is_found_again_at_its_true_size(tmp_path, capsys, kind, paper):
     file = tmp_path / "board.pdf"
     assert shadowgraph.main(["board", str(file), "--kind", kind, "--paper", paper]) == 0

@@ -124,7 +124,7 @@ def test_how_white_surfaces_are_shows_in_what_they_send_each_other(true, room, g
 @pytest.mark.parametrize("ground_known", [True, False])
 def test_light_between_surfaces_turns_no_normals(ground_known):
     """Three solids that stand close, whose light for each other the photos show: their creases look flat without it."""
-    photos, truth = render(HEAP, Look(width=160, height=120, n_lights=20, noise=0.002))
+    photos, truth = render(HEAP, Look(n_lights=16, noise=0.002))
     if not ground_known:
         photos = replace(photos, ground_known=False, mask=torch.from_numpy(truth.mask).float())
     fields = fields_of(truth)

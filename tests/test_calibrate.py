@@ -23,6 +23,7 @@ from capture.files.names import frame_path
 from capture.photos.finding import Finding
 from capture.session.session import Session, SessionSettings
 
+pytestmark = pytest.mark.usefixtures("few_starts")
 FLAT_SHEET = SimpleNamespace(on_sheet=lambda corners: corners)
 
 

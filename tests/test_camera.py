@@ -23,15 +23,6 @@ def views(camera, n, rng, noise_px=0.1):
     return [corners_of(BOARD, camera, slanted(rng, tilt), noise_px, rng) for tilt in tilts]
 
 
-def test_resized_agrees_with_what_opencv_does_to_a_ramp():
-    ramp = np.tile(np.arange(64, dtype=np.float32), (48, 1))
-    small = cv2.resize(ramp, (32, 24), interpolation=cv2.INTER_AREA)
-    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
-    point = np.array([0.08, 0.0, 1.0])  # seen at column 35.5 of the ramp
-    u = camera.resized(32, 24).project(point)[0]
-    assert np.interp(u, np.arange(32), small[12]) == pytest.approx(camera.project(point)[0], abs=1e-6)
-
-
 def test_the_stated_sigma_of_one_oblique_photo_is_the_spread_of_its_focal_length():
     rng = np.random.default_rng(2)
     pulls = []

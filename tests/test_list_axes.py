@@ -81,7 +81,7 @@ def listed_so_that(way):
     return found
 
 
-@pytest.mark.parametrize(("height", "way"), [*((egg, way) for way in range(8)), (waves, 0), (waves, 2), (saddle, 5)])
+@pytest.mark.parametrize(("height", "way"), [(egg, 0), (egg, 1), (egg, 6), (waves, 0), (waves, 2), (saddle, 5)])
 def test_the_way_that_a_list_fits_is_said_with_the_figures(tmp_path, height, way):
     said = warnings_of(write(tmp_path, height, listed_so_that(way)))
     if way == 0 or (way == 2 and height is not egg):  # of a relief, hills and dales look the same

@@ -89,16 +89,16 @@ def calibrated(monkeypatch):
 
 def with_another(lights, both):
     """Photos under one flashlight, and those of `both` under another of its power, too."""
-    stack = photograph(Recipe(width=WIDTH, lights=of_power(lights, 0.5, range(N)))).stack
-    other = photograph(Recipe(width=WIDTH, lights=of_power((*lights[5:], *lights[:5]), 0.5, range(N)))).stack
+    every = range(len(lights))
+    stack = photograph(Recipe(width=WIDTH, lights=of_power(lights, 0.5, every))).stack
+    other = photograph(Recipe(width=WIDTH, lights=of_power((*lights[5:], *lights[:5]), 0.5, every))).stack
     return replace(stack, rgb=stack.rgb + other.rgb * both[:, None, None, None])
 
 
-def test_photos_under_two_flashlights_are_told_and_left_out_before_outlines_are_looked_for(
-    lights, calibrated, monkeypatch
-):
+def test_photos_under_two_flashlights_are_told_and_left_out_before_outlines_are_looked_for(calibrated, monkeypatch):
     """Outlines cost most, and hide the second light: with them the powers are held alike."""
-    both, asked = np.arange(N) < 9, []
+    lights = handheld_lights(12, np.random.default_rng(4))
+    both, asked = np.arange(12) < 6, []
     monkeypatch.setattr(light_estimate, "with_outlines", lambda *given: asked.append(given[3]))
     found = calibrated(with_another(lights, both))
     left_out = np.array(["a second light is on" in light.reason for light in found.lights])

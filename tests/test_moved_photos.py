@@ -151,7 +151,7 @@ def framed(stack: PhotoStack, board: PhotoStack):
     return framing_findings(stack, range(len(stack.paths)), board)
 
 
-@pytest.mark.parametrize(("scale", "degrees"), [(1.1, 0), (1.3, 0), (0.9, 0), (1.0, 180), (1.1, 180)])
+@pytest.mark.parametrize(("scale", "degrees"), [(1.3, 0), (1.0, 180), (0.9, 180)])
 def test_a_zoom_and_a_turn_of_the_photos_are_measured_and_allowed_for(eight, board, scale, degrees):
     true = about_middle(scale, degrees)
     changed = moved(eight, true)

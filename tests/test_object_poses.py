@@ -312,6 +312,7 @@ def test_a_surface_of_all_meets_the_rays_of_each_object_pose_unless_a_motion_is_
     wrong = how_met(object_poses[1], surface, stepped(motion, np.array([0, 0, 0, 2.5, 2.0, 0]), MIDDLE))
     assert not right.is_worse(1.5) and right.excess < 1.2
     assert wrong.is_worse(1.5) and "turned_1" in wrong.numbers()
+    assert not replace(wrong, noise=wrong.together).is_worse(1.5)
 
 
 @pytest.mark.slow

@@ -89,6 +89,17 @@ def test_the_true_surface_is_left_alone_by_its_own_shadows():
     assert float(off.mean()) < 0.2  # voxels; 0.25 while those labels counted
 
 
+def test_rays_that_contradict_their_labels_look_after_look_weigh_less():
+    scene, rays = shadows()
+    surface = LevelSet(ball().values.numpy() / 3.0, np.zeros(3), 3.0)
+    shoot = RayPasses(surface, scene, rays, FitConfig())
+    shoot.look(surface.grid(), 0, 8.0, 0.5)
+    before = shoot._drawn(0).weights
+    rays.wrong[...] = kernels.PATIENCE
+    assert len(before) > 100
+    np.testing.assert_allclose(shoot._drawn(0).weights, before / 2)
+
+
 # --- rays that never train -------------------------------------------------------------------------------------------
 
 
