@@ -93,7 +93,7 @@ def object_and_ground(
         raised = np.clip(worth * samples.raised_odds(usable, thing), 0, SURE)  # a level part's step may be nothing
         shown = np.logaddexp(np.log(1 - LEVEL_SHARE) + by_light, np.log(LEVEL_SHARE) + raised)
         in_gap = worth * (samples.gap_odds(near, scatter, thing) * usable).sum(0) / np.maximum(count, 1)
-        said = 0.0 if witness is None else witness_odds(witness, region, by_light < 0)
+        said = 0.0 if witness is None else witness_odds(witness, region)
         in_gap = np.where(told, np.clip(in_gap + shown - by_light + said / 2, -SURE, SURE), SURE)
         beside = shown + samples.look_odds(region, thing) + said
         before, either = region, np.minimum(beside, in_gap)
@@ -107,18 +107,15 @@ def object_and_ground(
     return ObjectAndGround(region, mean.astype(np.float32), odds, albedo)
 
 
-def witness_odds(witness: Witness, region: Region, like_ground: Region) -> Map:
+def witness_odds(witness: Witness, region: Region) -> Map:
     """Return log odds of object over ground by what a witness says: log(hits / false alarms), or that of their rests.
 
-    Both rates are counted against the region [Dawid and Skene 1979], apart where brightness is that of ground: a
-    witness that looks at brightness, too, misses an object's level parts together. Ground in a gap is called an object
-    as often as the geometric mean of the two rates says, so that half of this counts there.
+    Both rates are counted against the region [Dawid and Skene 1979]. Ground in a gap is called an object as often as
+    the geometric mean of the two says, so that half of this counts there.
     """
-    speaks, calls, odds = witness != 0, witness > 0, np.zeros(witness.shape)
-    for some in (like_ground, ~like_ground):
-        hits, alarms = (((calls & of).sum() + 1) / ((speaks & of).sum() + 2) for of in (region & some, ~region & some))
-        odds[some] = np.where(calls, np.log(hits / alarms), np.log((1 - hits) / (1 - alarms)))[some]
-    return speaks * odds
+    speaks, calls = witness != 0, witness > 0
+    hits, alarms = (((calls & of).sum() + 1) / ((speaks & of).sum() + 2) for of in (region, ~region))
+    return speaks * np.where(calls, np.log(hits / alarms), np.log((1 - hits) / (1 - alarms)))
 
 
 def _worth(single: Maps, lit: Bool[np.ndarray, "photos height width"]) -> float:
